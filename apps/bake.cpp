@@ -1,0 +1,114 @@
+// SPDX-License-Identifier: Apache-2.0
+// vdbtrack bake: density in, sidecar out.
+#include "command_line.h"
+
+#include "bake.h"
+#include "error.h"
+#include "io/density.h"
+#include "io/sidecar.h"
+
+#include <chrono>
+#include <cstdio>
+#include <filesystem>
+#include <iostream>
+
+namespace apps {
+namespace {
+
+namespace po = boost::program_options;
+
+void run(const Command& command, const std::vector<std::string>& given) {
+    po::options_description options("Options");
+    options.add_options()("output,o", po::value<std::string>(),
+                          "sidecar to write; default: IN.track.vdb")(
+        "size", po::value<int>()->default_value(16),
+        "edge of a super-voxel in voxels: 4, 8, 16, 32 or 64")(
+        "control", po::value<std::string>()->default_value("constant"),
+        "control extinction of a super-voxel: constant (its mean)")(
+        "levels", po::value<int>()->default_value(4),
+        "preview levels, each of super-voxels twice as large, 0 to 8")(
+        "force", po::bool_switch(), "replace an existing sidecar");
+    addGridOptions(options);
+    const Arguments arguments(command, given, options, {"IN.vdb"}, 1);
+
+    const std::string input = arguments.text("IN.vdb");
+    const int size = arguments.get<int>("size");
+    if (size < 4 || size > 64 || (size & (size - 1)) != 0) {
+        throw UsageError("--size " + std::to_string(size) + ": expected 4, 8, 16, 32 or 64");
+    }
+    choiceIndex("control", arguments.text("control"), {"constant"});
+    const int levels = arguments.integer("levels", 0, 8);
+    const std::string output =
+        arguments.has("output") ? arguments.text("output") : trk::defaultSidecarPath(input);
+    std::error_code ignored;
+    if (std::filesystem::equivalent(input, output, ignored)) {
+        throw trk::Error(TRK_ERROR_IO, output + ": is the input; expected another output");
+    }
+
+    const auto start = std::chrono::steady_clock::now();
+    const auto seconds = [&] {
+        return std::chrono::duration<double>(std::chrono::steady_clock::now() - start).count();
+    };
+    trk::DensityOptions densityOptions;
+    densityOptions.gridNamed = arguments.has("grid");
+    densityOptions.gridName = arguments.text("grid");
+    densityOptions.repair = repairBits(arguments);
+    trk::Density density;
+    {
+        const Progress progress(arguments, "reading " + input);
+        density = trk::loadDensity(input, densityOptions);
+    }
+    const double readTime = seconds();
+    trk::OutputFile file(output, arguments.flag("force"));
+    const trk::DensitySummary& summary = density.summary;
+    trk::SidecarHeader header;
+    header.toolVersion = TRACK_VERSION;
+    header.sourceFile = std::filesystem::path(input).filename().string();
+    header.source = summary.grid;
+    header.valueType = summary.valueType;
+    header.digest = summary.digest;
+    header.indexToWorld = summary.indexToWorld;
+    header.superVoxelSize = size;
+    header.levels = levels;
+    header.repair = summary.repair;
+    header.dropped = summary.dropped;
+    header.clamped = summary.clamped;
+    trk::BakedVolume baked;
+    {
+        const Progress progress(arguments, "baking " + input);
+        baked = vdbtools::bake(density.field, size, levels);
+    }
+    const double bakeTime = seconds() - readTime;
+    {
+        const Progress progress(arguments, "writing " + output);
+        trk::writeSidecar(file, header, baked, summary.anchor);
+        file.commit();
+    }
+    if (baked.items.empty()) {
+        std::cerr << "vdbtrack: warning: " << input << ": grid " << summary.grid.name
+                  << " is empty; its sidecar holds nothing and its transmittance is 1\n";
+    }
+    if (!arguments.quiet()) {
+        std::cerr << output << ": " << baked.items.size() << " super-voxels of " << size
+                  << "^3 voxels, " << levels << " levels, "
+                  << byteCount(std::filesystem::file_size(output));
+        if (summary.dropped + summary.clamped > 0) {
+            std::cerr << "; " << summary.dropped << " values that were not finite and "
+                      << summary.clamped << " negative ones read as 0";
+        }
+        char times[96];
+        std::snprintf(times, sizeof(times), " (read %.3g s, baked %.3g s, wrote %.3g s)\n",
+                      readTime, bakeTime, seconds() - readTime - bakeTime);
+        std::cerr << times;
+    }
+}
+
+}  // namespace
+
+const Command kBakeCommand{
+    "bake",
+    "vdbtrack bake IN.vdb [-o OUT.track.vdb] [--grid NAME] [--size 16] [--control constant] "
+    "[--levels 4] [--force]",
+    "Bakes control extinction and bounds of the residual into a sidecar.", run};
+
+}  // namespace apps

@@ -1,0 +1,175 @@
+// SPDX-License-Identifier: Apache-2.0
+#include "command_line.h"
+
+#include <tbb/global_control.h>
+#include <tbb/info.h>
+#include <unistd.h>
+
+#include <cmath>
+#include <cstdio>
+#include <iostream>
+#include <memory>
+#include <mutex>
+#include <utility>
+
+namespace apps {
+namespace po = boost::program_options;
+
+namespace {
+
+// TBB obeys this for as long as it lives: to the end of the process.
+std::unique_ptr<tbb::global_control> threadLimit;
+
+std::mutex progressMutex;
+
+}  // namespace
+
+Arguments::Arguments(const Command& command, const std::vector<std::string>& arguments,
+                     po::options_description options, const std::vector<std::string>& positional,
+                     size_t required) {
+    options.add_options()("quiet,q", po::bool_switch(), "only errors on stderr")(
+        "threads", po::value<int>()->default_value(0), "threads to use; 0: all")(
+        "help,h", po::bool_switch(), "this text");
+    po::options_description all = options;
+    po::positional_options_description positions;
+    for (const std::string& name : positional) {
+        all.add_options()(name.c_str(), po::value<std::string>());
+        positions.add(name.c_str(), 1);
+    }
+    try {
+        namespace style = po::command_line_style;
+        po::store(po::command_line_parser(arguments)
+                      .options(all)
+                      .positional(positions)
+                      .style(style::unix_style & ~style::allow_guessing)
+                      .run(),
+                  values_);
+        po::notify(values_);
+    } catch (const po::too_many_positional_options_error&) {
+        throw UsageError("too many arguments");
+    } catch (const po::error& e) {
+        throw UsageError(e.what());
+    }
+    if (flag("help")) {
+        std::cout << "usage: " << command.synopsis << "\n\n"
+                  << command.summary << "\n\n"
+                  << options << "\n";
+        throw HelpShown{};
+    }
+    for (size_t i = 0; i < required; ++i) {
+        if (!has(positional[i]) || text(positional[i]).empty()) {
+            throw UsageError("missing argument " + positional[i]);
+        }
+    }
+    threads_ = integer("threads", 0, 4096);
+    if (threads_ > 0) {
+        threadLimit = std::make_unique<tbb::global_control>(
+            tbb::global_control::max_allowed_parallelism, static_cast<size_t>(threads_));
+    }
+}
+
+int Arguments::integer(const std::string& name, int lo, int hi) const {
+    const int value = get<int>(name);
+    if (value < lo || value > hi) {
+        throw UsageError("--" + name + " " + std::to_string(value) + ": expected " +
+                         std::to_string(lo) + " to " + std::to_string(hi));
+    }
+    return value;
+}
+
+void addGridOptions(po::options_description& options) {
+    options.add_options()("grid", po::value<std::string>(),
+                          "grid to read, NAME or NAME[i]; default: the only one that can be a "
+                          "density, else density")("drop-nonfinite", po::bool_switch(),
+                                                   "read NaN and infinite densities as 0")(
+        "clamp-negative", po::bool_switch(), "read negative densities as 0");
+}
+
+uint32_t repairBits(const Arguments& arguments) {
+    uint32_t bits = 0;
+    if (arguments.flag("drop-nonfinite")) {
+        bits |= TRK_REPAIR_DROP_NONFINITE;
+    }
+    if (arguments.flag("clamp-negative")) {
+        bits |= TRK_REPAIR_CLAMP_NEGATIVE;
+    }
+    return bits;
+}
+
+float nonNegative(const Arguments& arguments, const std::string& option) {
+    const float value = arguments.get<float>(option);
+    if (!(value >= 0) || !std::isfinite(value)) {
+        throw UsageError("--" + option + ": expected a finite number >= 0");
+    }
+    return value;
+}
+
+int choiceIndex(const std::string& option, const std::string& name,
+                const std::vector<std::string>& names) {
+    std::string list;
+    for (size_t i = 0; i < names.size(); ++i) {
+        if (names[i] == name) {
+            return static_cast<int>(i);
+        }
+        list += (i == 0 ? "" : ", ") + names[i];
+    }
+    throw UsageError("--" + option + " " + name + ": expected one of " + list);
+}
+
+std::vector<double> numberList(const std::string& option, const std::string& text, size_t count) {
+    std::vector<double> numbers;
+    size_t begin = 0;
+    bool good = true;
+    while (good && begin <= text.size()) {
+        const size_t end = std::min(text.find(',', begin), text.size());
+        const std::string part = text.substr(begin, end - begin);
+        char* parsed = nullptr;
+        numbers.push_back(std::strtod(part.c_str(), &parsed));
+        good = !part.empty() && *parsed == '\0' && std::isfinite(numbers.back());
+        begin = end + 1;
+    }
+    if (!good || numbers.size() != count) {
+        throw UsageError("--" + option + " " + text + ": expected " + std::to_string(count) +
+                         " numbers separated by commas");
+    }
+    return numbers;
+}
+
+Progress::Progress(const Arguments& arguments, std::string label)
+    : label_(std::move(label)), shown_(!arguments.quiet() && isatty(STDERR_FILENO) == 1) {
+    if (shown_) {
+        std::fprintf(stderr, "%s …", label_.c_str());
+        std::fflush(stderr);
+    }
+}
+
+Progress::~Progress() {
+    if (shown_) {
+        std::fputs("\r\033[K", stderr);
+    }
+}
+
+void Progress::update(double fraction) {
+    const std::lock_guard<std::mutex> lock(progressMutex);
+    const int percent = static_cast<int>(100 * fraction);
+    if (shown_ && percent > percent_) {
+        percent_ = percent;
+        std::fprintf(stderr, "\r%s … %d %%", label_.c_str(), percent);
+        std::fflush(stderr);
+    }
+}
+
+std::string byteCount(uint64_t bytes) {
+    const char* const units[] = {"bytes", "kB", "MB", "GB", "TB"};
+    auto value = static_cast<double>(bytes);
+    size_t unit = 0;
+    while (value >= 999.5 && unit + 1 < std::size(units)) {
+        value /= 1000;
+        ++unit;
+    }
+    char text[32];
+    std::snprintf(text, sizeof(text), unit == 0 ? "%.0f %s" : "%.3g %s", value, units[unit]);
+    return text;
+}
+
+}  // namespace apps

@@ -1,0 +1,102 @@
+// SPDX-License-Identifier: Apache-2.0
+// What the commands share: options, usage errors, progress, names of choices.
+#pragma once
+
+#include "track/track.h"
+
+#include <boost/program_options.hpp>
+
+#include <stdexcept>
+#include <string>
+#include <vector>
+
+namespace apps {
+
+/// A mistake in the command line: exit code 2.
+class UsageError : public std::runtime_error {
+  public:
+    using std::runtime_error::runtime_error;
+};
+
+/// One command of vdbtrack.
+struct Command {
+    const char* name;
+    const char* synopsis;  ///< "vdbtrack bake IN.vdb [-o …]"
+    const char* summary;   ///< one sentence
+    void (*run)(const Command& command, const std::vector<std::string>& arguments);
+};
+
+extern const Command kMakeCommand;
+extern const Command kBakeCommand;
+extern const Command kInfoCommand;
+extern const Command kVerifyCommand;
+extern const Command kQueryCommand;
+extern const Command kPreviewCommand;
+
+/// Thrown after --help was printed.
+struct HelpShown {};
+
+/// Parsed arguments of one command. Positional arguments come first in `positional`, in order;
+/// those from `required` on are optional. --help, --quiet and --threads are added to `options`.
+class Arguments {
+  public:
+    Arguments(const Command& command, const std::vector<std::string>& arguments,
+              boost::program_options::options_description options,
+              const std::vector<std::string>& positional, size_t required);
+
+    bool has(const std::string& name) const { return values_.count(name) > 0; }
+    template <class T>
+    const T& get(const std::string& name) const {
+        return values_[name].as<T>();
+    }
+    bool flag(const std::string& name) const { return has(name) && get<bool>(name); }
+    std::string text(const std::string& name) const {
+        return has(name) ? get<std::string>(name) : std::string();
+    }
+    bool quiet() const { return flag("quiet"); }
+    int threads() const { return threads_; }
+
+    /// The integer value of an option that must lie in [lo, hi].
+    int integer(const std::string& name, int lo, int hi) const;
+
+  private:
+    boost::program_options::variables_map values_;
+    int threads_ = 0;
+};
+
+/// Options of opening a volume that several commands share: --grid, --drop-nonfinite,
+/// --clamp-negative.
+void addGridOptions(boost::program_options::options_description& options);
+uint32_t repairBits(const Arguments& arguments);
+
+/// A finite number >= 0, or a UsageError that names the option.
+float nonNegative(const Arguments& arguments, const std::string& option);
+
+/// The value of `name` among `names`, or a UsageError that lists them.
+int choiceIndex(const std::string& option, const std::string& name,
+                const std::vector<std::string>& names);
+
+/// Numbers separated by commas, or a UsageError: `count` of them.
+std::vector<double> numberList(const std::string& option, const std::string& text, size_t count);
+
+/// A line on stderr, overwritten as work goes on: only on a terminal, and not with --quiet.
+class Progress {
+  public:
+    Progress(const Arguments& arguments, std::string label);
+    ~Progress();
+    Progress(const Progress&) = delete;
+    Progress& operator=(const Progress&) = delete;
+
+    /// Safe from any thread.
+    void update(double fraction);
+
+  private:
+    std::string label_;
+    bool shown_;
+    int percent_ = -1;
+};
+
+/// "1.5 MB".
+std::string byteCount(uint64_t bytes);
+
+}  // namespace apps

@@ -1,0 +1,88 @@
+// SPDX-License-Identifier: Apache-2.0
+#include "image.h"
+
+#include "error.h"
+
+#include <ImfChannelList.h>
+#include <ImfFrameBuffer.h>
+#include <ImfHeader.h>
+#include <ImfOutputFile.h>
+#include <ImfStringAttribute.h>
+#include <png.h>
+
+#include <cmath>
+#include <cstdint>
+#include <cstdio>
+#include <cstring>
+#include <memory>
+
+namespace apps {
+namespace {
+
+[[noreturn]] void cannotWrite(const trk::OutputFile& file, const std::string& why) {
+    throw trk::Error(TRK_ERROR_IO, file.target() + ": cannot be written: " + why);
+}
+
+/// Linear up to 0.6, then rolled off so that 1.4 still keeps a shade below white.
+float toneMap(float x) {
+    constexpr float kShoulder = 0.6f;
+    if (x > kShoulder) {
+        const float room = 1 - kShoulder;
+        x = kShoulder + room * (1 - std::exp(-(x - kShoulder) / room));
+    }
+    return x;
+}
+
+uint8_t encodeSrgb(float linear) {
+    const float x = std::fmin(std::fmax(linear, 0.0f), 1.0f);
+    const float s = x <= 0.0031308f ? 12.92f * x : 1.055f * std::pow(x, 1 / 2.4f) - 0.055f;
+    return static_cast<uint8_t>(std::lround(255 * s));
+}
+
+}  // namespace
+
+void writeExr(const Image& image, const std::map<std::string, std::string>& attributes,
+              const trk::OutputFile& file) {
+    try {
+        Imf::Header header(image.width, image.height);
+        Imf::FrameBuffer frame;
+        for (const auto& [name, values] : image.channels) {
+            header.channels().insert(name, Imf::Channel(Imf::FLOAT));
+            // OpenEXR's slices are for reading too, hence not const; writing leaves them alone.
+            char* base = const_cast<char*>(reinterpret_cast<const char*>(values.data()));
+            frame.insert(name, Imf::Slice(Imf::FLOAT, base, sizeof(float),
+                                          sizeof(float) * static_cast<size_t>(image.width)));
+        }
+        for (const auto& [name, text] : attributes) {
+            header.insert(name, Imf::StringAttribute(text));
+        }
+        Imf::OutputFile out(file.path().c_str(), header);
+        out.setFrameBuffer(frame);
+        out.writePixels(image.height);
+    } catch (const std::exception& e) {
+        const std::string text = e.what();
+        cannotWrite(file, text.substr(0, text.find('\n')));
+    }
+}
+
+void writePng(const Image& image, const trk::OutputFile& file) {
+    std::vector<uint8_t> bytes(image.pixelCount() * 3);
+    const char* const names[] = {"R", "G", "B"};
+    for (size_t c = 0; c < 3; ++c) {
+        const std::vector<float>& channel = image.channels.at(names[c]);
+        for (size_t i = 0; i < channel.size(); ++i) {
+            bytes[3 * i + c] = encodeSrgb(toneMap(channel[i]));
+        }
+    }
+    png_image png;
+    std::memset(&png, 0, sizeof(png));
+    png.version = PNG_IMAGE_VERSION;
+    png.width = static_cast<png_uint_32>(image.width);
+    png.height = static_cast<png_uint_32>(image.height);
+    png.format = PNG_FORMAT_RGB;
+    if (!png_image_write_to_file(&png, file.path().c_str(), 0, bytes.data(), 0, nullptr)) {
+        cannotWrite(file, png.message);
+    }
+}
+
+}  // namespace apps

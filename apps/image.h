@@ -1,0 +1,35 @@
+// SPDX-License-Identifier: Apache-2.0
+// Images of what a preview computed: EXR for data, PNG for eyes.
+#pragma once
+
+#include "io/output_file.h"
+
+#include <cstddef>
+#include <map>
+#include <string>
+#include <vector>
+
+namespace apps {
+
+/// Named float channels of one size, top row first, linear.
+struct Image {
+    int width = 0;
+    int height = 0;
+    std::map<std::string, std::vector<float>> channels;
+
+    Image(int w, int h) : width(w), height(h) {}
+    size_t pixelCount() const { return static_cast<size_t>(width) * static_cast<size_t>(height); }
+    std::vector<float>& add(const std::string& name) {
+        return channels[name] = std::vector<float>(pixelCount());
+    }
+};
+
+/// Writes every channel as 32-bit float, with text attributes. Does not commit. Throws trk::Error.
+void writeExr(const Image& image, const std::map<std::string, std::string>& attributes,
+              const trk::OutputFile& file);
+
+/// Writes channels R, G, B tone-mapped: the highlights rolled off, sRGB encoded, 8 bit. Does not
+/// commit. Throws trk::Error.
+void writePng(const Image& image, const trk::OutputFile& file);
+
+}  // namespace apps

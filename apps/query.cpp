@@ -1,0 +1,212 @@
+// SPDX-License-Identifier: Apache-2.0
+// vdbtrack query: transmittance of the rays of a CSV file.
+#include "command_line.h"
+
+#include "error.h"
+#include "io/output_file.h"
+#include "track/track.hpp"
+
+#include <charconv>
+#include <cmath>
+#include <cstdio>
+#include <fstream>
+#include <iostream>
+#include <limits>
+#include <sstream>
+
+namespace apps {
+namespace {
+
+namespace po = boost::program_options;
+
+const std::vector<std::string> kMethods{"exact", "residual", "ratio", "control"};
+const std::vector<std::string> kChoices{"robust", "mean", "min", "max"};
+
+/// The numbers of one line, or none where a field is not a number.
+std::vector<float> parseFields(const std::string& line) {
+    std::vector<float> values;
+    const char* at = line.data();
+    const char* const end = at + line.size();
+    const auto skipSpace = [&] {
+        while (at != end && (*at == ' ' || *at == '\t')) {
+            ++at;
+        }
+    };
+    for (;;) {
+        skipSpace();
+        if (at != end && *at == '+') {
+            ++at;
+        }
+        float value = 0;
+        const auto [next, error] = std::from_chars(at, end, value);
+        if (error != std::errc()) {
+            return {};
+        }
+        values.push_back(value);
+        at = next;
+        skipSpace();
+        if (at == end) {
+            return values;
+        }
+        if (*at++ != ',') {
+            return {};
+        }
+    }
+}
+
+std::vector<TrkRay> readRays(const std::string& path) {
+    std::ifstream stream(path);
+    if (!stream) {
+        throw trk::Error(TRK_ERROR_IO, path + ": cannot be opened");
+    }
+    std::vector<TrkRay> rays;
+    std::string line;
+    bool first = true;  // a header may stand before the first ray
+    for (size_t number = 1; std::getline(stream, line); ++number) {
+        if (!line.empty() && line.back() == '\r') {
+            line.pop_back();
+        }
+        if (line.find_first_not_of(" \t") == std::string::npos || line[0] == '#') {
+            continue;
+        }
+        const std::vector<float> v = parseFields(line);
+        const bool letters = std::isalpha(static_cast<unsigned char>(line[0])) != 0 &&
+                             line.find("inf") != 0 && line.find("nan") != 0;
+        if (v.empty() && first && letters) {
+            first = false;
+            continue;
+        }
+        first = false;
+        if (v.size() != 6 && v.size() != 8) {
+            throw trk::Error(TRK_ERROR_INVALID_ARGUMENT,
+                             path + ": line " + std::to_string(number) +
+                                 ": expected ox,oy,oz,dx,dy,dz[,tmin,tmax], found " +
+                                 (v.empty() ? "\"" + line.substr(0, 60) + "\""
+                                            : std::to_string(v.size()) + " numbers"));
+        }
+        TrkRay ray{
+            {v[0], v[1], v[2]}, 0, {v[3], v[4], v[5]}, std::numeric_limits<float>::infinity()};
+        if (v.size() == 8) {
+            ray.tMin = v[6];
+            ray.tMax = v[7];
+        }
+        rays.push_back(ray);
+    }
+    if (stream.bad()) {
+        throw trk::Error(TRK_ERROR_IO, path + ": cannot be read");
+    }
+    return rays;
+}
+
+/// 9 significant digits; nothing for NaN.
+std::string number(double value) {
+    if (std::isnan(value)) {
+        return {};
+    }
+    char text[32];
+    std::snprintf(text, sizeof(text), "%.9g", value);
+    return text;
+}
+
+void run(const Command& command, const std::vector<std::string>& given) {
+    po::options_description options("Options");
+    options.add_options()("rays", po::value<std::string>(),
+                          "CSV file: ox,oy,oz,dx,dy,dz[,tmin,tmax] a line, world space")(
+        "sidecar", po::value<std::string>(), "default: IN.track.vdb, where it exists")(
+        "method", po::value<std::string>()->default_value("residual"),
+        "exact, residual, ratio or control")("samples", po::value<int>()->default_value(16),
+                                             "estimates averaged per ray")(
+        "rate", po::value<float>()->default_value(1.0f, "1"),
+        "multiplies the sampling rate of residual and ratio")(
+        "choice", po::value<std::string>()->default_value("robust"),
+        "control of the residual method: robust, mean, min or max")(
+        "level", po::value<int>()->default_value(0), "preview level of the control method")(
+        "seed", po::value<uint64_t>()->default_value(0), "of the random numbers")(
+        "stream", po::value<uint64_t>()->default_value(0), "independent random numbers")(
+        "scale", po::value<float>()->default_value(1.0f, "1"), "extinction = scale x density")(
+        "output,o", po::value<std::string>(), "CSV file to write; default: stdout")(
+        "force", po::bool_switch(), "replace an existing file");
+    addGridOptions(options);
+    const Arguments arguments(command, given, options, {"IN.vdb"}, 1);
+    if (!arguments.has("rays")) {
+        throw UsageError("missing --rays RAYS.csv");
+    }
+    TrkQuery query = trkDefaultQuery();
+    query.method = choiceIndex("method", arguments.text("method"), kMethods);
+    query.samples =
+        static_cast<uint32_t>(arguments.integer("samples", 1, std::numeric_limits<int>::max()));
+    query.rate = arguments.get<float>("rate");
+    if (!(query.rate > 0) || !std::isfinite(query.rate)) {
+        throw UsageError("--rate: expected a finite number > 0");
+    }
+    query.level = static_cast<uint32_t>(arguments.integer("level", 0, 64));
+    query.seed = arguments.get<uint64_t>("seed");
+    query.stream = arguments.get<uint64_t>("stream");
+    TrkVolumeOptions volumeOptions = trkDefaultVolumeOptions();
+    volumeOptions.scale = nonNegative(arguments, "scale");
+    volumeOptions.choice = choiceIndex("choice", arguments.text("choice"), kChoices);
+    volumeOptions.repair = repairBits(arguments);
+    const std::string grid = arguments.text("grid");
+    volumeOptions.gridName = arguments.has("grid") ? grid.c_str() : nullptr;
+
+    const std::vector<TrkRay> rays = readRays(arguments.text("rays"));
+    const std::string sidecar = arguments.text("sidecar");
+    // What needs no sidecar also must not fail over one that does not fit.
+    const bool useSidecar = query.method != TRK_METHOD_EXACT || arguments.has("sidecar");
+    const track::Volume volume = track::Volume::open(arguments.text("IN.vdb"),
+                                                     arguments.has("sidecar") ? sidecar.c_str()
+                                                     : useSidecar             ? nullptr
+                                                                              : "",
+                                                     volumeOptions);
+
+    std::ostringstream out;
+    out << "ray,transmittance,stderr,optical_depth,lookups\n";
+    constexpr size_t kChunk = 1 << 14;
+    const bool deterministic =
+        query.method == TRK_METHOD_EXACT || query.method == TRK_METHOD_CONTROL;
+    std::vector<float> transmittance(kChunk);
+    std::vector<TrkStatistics> statistics(kChunk);
+    std::vector<double> depth(kChunk, std::numeric_limits<double>::quiet_NaN());
+    {
+        Progress progress(arguments, "tracing " + std::to_string(rays.size()) + " rays");
+        for (size_t begin = 0; begin < rays.size() || begin == 0; begin += kChunk) {
+            const size_t count = std::min(kChunk, rays.size() - begin);
+            query.firstRayId = begin;
+            volume.estimateTransmittance(query, rays.data() + begin, count, transmittance.data(),
+                                         statistics.data());
+            if (deterministic) {
+                volume.integrateOpticalDepth(query, rays.data() + begin, count, depth.data());
+            }
+            for (size_t i = 0; i < count; ++i) {
+                out << begin + i << ',' << number(static_cast<double>(transmittance[i])) << ','
+                    << number(static_cast<double>(statistics[i].standardError[0])) << ','
+                    << number(depth[i]) << ',' << statistics[i].lookups << '\n';
+            }
+            progress.update(static_cast<double>(begin + count) /
+                            static_cast<double>(std::max<size_t>(rays.size(), 1)));
+        }
+    }
+    if (!arguments.has("output")) {
+        std::cout << out.str();
+        return;
+    }
+    trk::OutputFile file(arguments.text("output"), arguments.flag("force"));
+    std::ofstream stream(file.path(), std::ios::binary);
+    stream << out.str();
+    stream.close();
+    if (!stream) {
+        throw trk::Error(TRK_ERROR_IO, file.target() + ": cannot be written (disk full?)");
+    }
+    file.commit();
+}
+
+}  // namespace
+
+const Command kQueryCommand{
+    "query",
+    "vdbtrack query IN.vdb --rays RAYS.csv [--sidecar S] [--grid NAME] [--method residual] "
+    "[--samples 16] [--rate 1] [--choice robust] [--level 0] [--seed 0] [--stream 0] [--scale 1] "
+    "[-o OUT.csv] [--force]",
+    "Prints the transmittance of rays: ray,transmittance,stderr,optical_depth,lookups.", run};
+
+}  // namespace apps

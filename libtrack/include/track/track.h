@@ -1,0 +1,242 @@
+/* SPDX-License-Identifier: Apache-2.0 */
+/* libtrack: transmittance of straight rays through OpenVDB volumes. The whole C API, valid C99. */
+#ifndef TRACK_TRACK_H
+#define TRACK_TRACK_H
+
+#include <stddef.h>
+#include <stdint.h>
+
+#if defined(TRACK_STATIC)
+#define TRK_API
+#elif defined(_WIN32)
+#ifdef TRACK_BUILD
+#define TRK_API __declspec(dllexport)
+#else
+#define TRK_API __declspec(dllimport)
+#endif
+#else
+#define TRK_API __attribute__((visibility("default")))
+#endif
+
+#ifdef __cplusplus
+extern "C" {
+#endif
+
+/* ---- Version --------------------------------------------------------------------------------- */
+
+/** Version of the library at run time, "major.minor.patch". Static storage. */
+TRK_API const char* trkGetVersion(void);
+
+/* ---- Status ---------------------------------------------------------------------------------- */
+
+typedef int32_t TrkStatus;
+enum {
+    TRK_OK = 0,
+    TRK_ERROR_INVALID_ARGUMENT = 1, /**< an argument breaks its contract */
+    TRK_ERROR_IO = 2,               /**< a file cannot be opened, read or written */
+    TRK_ERROR_BAD_FILE = 3,         /**< not a VDB file, or a damaged or too new one */
+    TRK_ERROR_GRID_NOT_FOUND = 4,   /**< no such grid, or several of that name */
+    TRK_ERROR_UNSUPPORTED_GRID = 5, /**< a grid whose type, class or map cannot be a density */
+    TRK_ERROR_BAD_DENSITY = 6,      /**< negative, NaN or infinite values, or a background not 0 */
+    TRK_ERROR_SIDECAR_MISMATCH = 7, /**< the sidecar belongs to another density or version */
+    TRK_ERROR_NO_SIDECAR = 8,       /**< the method needs a sidecar and the volume has none */
+    TRK_ERROR_NO_DENSITY = 9,       /**< the method needs the density; only a sidecar is open */
+    TRK_ERROR_OUT_OF_MEMORY = 10,   /**< no memory left, or more than maxMemory wanted */
+    TRK_ERROR_UNKNOWN = 11
+};
+
+/** "TRK_OK", "TRK_ERROR_IO", …; "TRK_ERROR_UNKNOWN" for any other number. Static storage. */
+TRK_API const char* trkGetStatusName(TrkStatus status);
+
+/** One line on what the last failing call *of this thread* found: file, grid, expected, found.
+ * Empty before the first failure; a call that succeeds leaves it alone. Valid until this thread's
+ * next failing call. */
+TRK_API const char* trkGetLastErrorMessage(void);
+
+/* ---- Types ----------------------------------------------------------------------------------- */
+
+/** An opened, immutable volume. Any number of threads may query one; only closing it must not run
+ *  beside other calls on it. */
+typedef struct TrkVolume TrkVolume;
+
+/** The points origin + t direction, t in [tMin, tMax], in world space. The direction need not have
+ *  unit length: optical depth is an integral over length, not over t. tMax may be infinite and tMin
+ *  negative; tMin >= tMax is an empty interval, whose transmittance is 1. */
+typedef struct TrkRay {
+    float origin[3];
+    float tMin;
+    float direction[3];
+    float tMax;
+} TrkRay;
+
+/** How transmittance is computed. Methods with "unbiased" have the exact value as their mean;
+ * single estimates may then be negative or exceed 1, and are never clamped. */
+typedef int32_t TrkMethod;
+enum {
+    TRK_METHOD_EXACT = 0,    /**< regular tracking: closed form per voxel cell, no noise, slowest */
+    TRK_METHOD_RESIDUAL = 1, /**< residual ratio tracking, unbiased; needs a sidecar [Novak14] */
+    TRK_METHOD_RATIO = 2,    /**< ratio tracking, unbiased; needs a sidecar [Novak14] */
+    TRK_METHOD_CONTROL = 3   /**< the baked control alone: biased, no noise, for level of detail */
+};
+
+/** The constant control of the residual method, chosen per super-voxel when a volume is opened. */
+typedef int32_t TrkChoice;
+enum {
+    TRK_CHOICE_ROBUST =
+        0,               /**< near the mean in thin super-voxels, near the minimum in thick ones */
+    TRK_CHOICE_MEAN = 1, /**< the mean: least variance where super-voxels are thin */
+    TRK_CHOICE_MIN = 2,  /**< the minimum: no estimate above the control's transmittance */
+    TRK_CHOICE_MAX = 3   /**< the maximum */
+};
+
+/** What opening a volume checks of its sidecar. */
+typedef int32_t TrkCheck;
+enum {
+    TRK_CHECK_FULL = 0,    /**< the density's digest and the plausibility of every bound */
+    TRK_CHECK_METADATA = 1 /**< names, versions and transforms only */
+};
+
+/** Bits of TrkVolumeOptions.repair: values to replace by 0 instead of refusing the grid. */
+enum { TRK_REPAIR_DROP_NONFINITE = 1, TRK_REPAIR_CLAMP_NEGATIVE = 2 };
+
+/* ---- Options --------------------------------------------------------------------------------- */
+
+/** How to open a volume. Fill it with trkDefaultVolumeOptions(), then change what you need. */
+typedef struct TrkVolumeOptions {
+    size_t size;          /**< sizeof(TrkVolumeOptions) */
+    const char* gridName; /**< NAME or NAME[i]; NULL: the only density-like grid, else "density" */
+    float scale;          /**< extinction = scale x density, in 1/world unit; finite and >= 0 */
+    TrkChoice choice;     /**< control of TRK_METHOD_RESIDUAL */
+    TrkCheck check;       /**< how far to distrust the sidecar */
+    uint32_t repair;      /**< TRK_REPAIR_… bits; those the sidecar was baked with are added */
+    uint64_t maxMemory;   /**< refuse to hold more bytes than this; 0: no limit */
+    int32_t threads;      /**< threads used for opening; 0: all */
+} TrkVolumeOptions;
+
+static inline TrkVolumeOptions trkDefaultVolumeOptions(void) {
+    TrkVolumeOptions options;
+    options.size = sizeof(TrkVolumeOptions);
+    options.gridName = NULL;
+    options.scale = 1.0f;
+    options.choice = TRK_CHOICE_ROBUST;
+    options.check = TRK_CHECK_FULL;
+    options.repair = 0;
+    options.maxMemory = 0;
+    options.threads = 0;
+    return options;
+}
+
+/** Bits of TrkQuery.flags. */
+enum {
+    /** Integrate a super-voxel exactly where tracking it would take more look-ups. On by default.
+     */
+    TRK_QUERY_EXACT_FALLBACK = 1
+};
+
+/** What to ask. Fill it with trkDefaultQuery(), then change what you need. A result depends on the
+ *  ray, its id, and the fields below but `threads` and `rayStride`: the same bits for single rays
+ * and batches, any threads, any split. Give different streams to different volumes or path segments
+ * that share ray ids: their estimates are then independent and may be multiplied. */
+typedef struct TrkQuery {
+    size_t size;         /**< sizeof(TrkQuery) */
+    TrkMethod method;    /**< default TRK_METHOD_RESIDUAL */
+    uint32_t samples;    /**< estimates averaged per ray, >= 1; methods without noise ignore it */
+    float rate;          /**< multiplies the sampling rate of residual and ratio; > 0. Any rate is
+                              unbiased: more look-ups, less variance */
+    uint32_t level;      /**< of TRK_METHOD_CONTROL: 0 the baked super-voxels, k 2^k larger ones */
+    uint32_t flags;      /**< TRK_QUERY_… bits */
+    uint64_t seed;       /**< of the random numbers */
+    uint64_t stream;     /**< see above */
+    uint64_t firstRayId; /**< ray i has id firstRayId + i, unless rayIds is given */
+    const uint64_t* rayIds; /**< one id a ray, or NULL */
+    size_t rayStride;       /**< bytes from one TrkRay to the next; 0: sizeof(TrkRay) */
+    int32_t threads;        /**< 0: all, 1: the calling thread alone, n: at most n */
+} TrkQuery;
+
+static inline TrkQuery trkDefaultQuery(void) {
+    TrkQuery query;
+    query.size = sizeof(TrkQuery);
+    query.method = TRK_METHOD_RESIDUAL;
+    query.samples = 1;
+    query.rate = 1.0f;
+    query.level = 0;
+    query.flags = TRK_QUERY_EXACT_FALLBACK;
+    query.seed = 0;
+    query.stream = 0;
+    query.firstRayId = 0;
+    query.rayIds = NULL;
+    query.rayStride = 0;
+    query.threads = 0;
+    return query;
+}
+
+/** What answering one ray took. */
+typedef struct TrkStatistics {
+    uint64_t lookups;       /**< density values interpolated, over all samples */
+    uint64_t superVoxels;   /**< occupied super-voxels (exact: bricks and tiles) met, all samples */
+    float standardError[3]; /**< of the mean, per channel; 0 for methods without noise, NaN for one
+                                 sample of a random one */
+    float exactShare;       /**< part of the clipped length that was integrated exactly, 0 to 1 */
+} TrkStatistics;
+
+/** What a volume holds. Strings live as long as the volume. */
+typedef struct TrkVolumeInfo {
+    size_t size;              /**< set by the caller: sizeof(TrkVolumeInfo) */
+    double boundsMin[3];      /**< world-space box outside which the extinction is 0; */
+    double boundsMax[3];      /**< min = max = 0 for an empty volume */
+    double indexToWorld[12];  /**< world = first nine (rows) x index + last three */
+    uint64_t activeVoxels;    /**< of the source grid; 0 where only a sidecar is open */
+    uint64_t bytes;           /**< held by the volume */
+    uint32_t channels;        /**< floats per ray that estimates write: 1 */
+    uint32_t hasDensity;      /**< 1 where exact, residual and ratio have what they look up */
+    uint32_t superVoxelSize;  /**< in voxels; 0 where there is no sidecar */
+    uint32_t superVoxelCount; /**< occupied ones; 0 where there is no sidecar */
+    uint32_t levels;          /**< preview levels above 0 */
+    const char* gridName;     /**< of the source grid */
+    const char* controlKind;  /**< "constant", or "" where there is no sidecar */
+    const char* storage;      /**< "float" or "half", "" where only a sidecar is open */
+} TrkVolumeInfo;
+
+/* ---- Volume ---------------------------------------------------------------------------------- */
+
+/** Opens a volume into *volume (NULL on failure); close it with trkCloseVolume.
+ *  vdbPath: the density, or NULL to open a sidecar alone (TRK_METHOD_CONTROL only).
+ *  sidecarPath: a file written by `vdbtrack bake`; NULL: NAME.track.vdb beside NAME.vdb if it
+ * exists;
+ *  "": none. A sidecar that does not fit the density is an error, never ignored.
+ *  options: NULL for the defaults.
+ *  Fails with INVALID_ARGUMENT, IO, BAD_FILE, GRID_NOT_FOUND, UNSUPPORTED_GRID, BAD_DENSITY,
+ *  SIDECAR_MISMATCH, OUT_OF_MEMORY. Thread-safe. */
+TRK_API TrkStatus trkOpenVolume(const char* vdbPath, const char* sidecarPath,
+                                const TrkVolumeOptions* options, TrkVolume** volume);
+
+/** Releases a volume; NULL is allowed. No other call may use it any more. */
+TRK_API void trkCloseVolume(TrkVolume* volume);
+
+/** Fills *info, whose size the caller has set. Thread-safe. */
+TRK_API TrkStatus trkGetVolumeInfo(const TrkVolume* volume, TrkVolumeInfo* info);
+
+/* ---- Query ----------------------------------------------------------------------------------- */
+
+/** Estimates the transmittance of rayCount rays.
+ *  query: NULL for the defaults. rays: query->rayStride bytes apart.
+ *  transmittance: room for `channels` floats a ray. statistics: room for one record a ray, or NULL.
+ *  A single ray takes no lock, allocation or task; a batch runs on TBB, isolated from the caller's
+ * own tasks. Fails with INVALID_ARGUMENT (naming the first bad ray), NO_SIDECAR or NO_DENSITY
+ * before any result is written. Thread-safe. */
+TRK_API TrkStatus trkEstimateTransmittance(const TrkVolume* volume, const TrkQuery* query,
+                                           const TrkRay* rays, size_t rayCount,
+                                           float* transmittance, TrkStatistics* statistics);
+
+/** Integrates the optical depth (the integral of extinction over length, without unit) of rayCount
+ *  rays. query->method: TRK_METHOD_EXACT or TRK_METHOD_CONTROL. opticalDepth: room for `channels`
+ *  doubles a ray. Otherwise as trkEstimateTransmittance. */
+TRK_API TrkStatus trkIntegrateOpticalDepth(const TrkVolume* volume, const TrkQuery* query,
+                                           const TrkRay* rays, size_t rayCount,
+                                           double* opticalDepth);
+
+#ifdef __cplusplus
+}
+#endif
+
+#endif /* TRACK_TRACK_H */

@@ -1,0 +1,273 @@
+// SPDX-License-Identifier: Apache-2.0
+// The only extern "C" file: validates, calls, and turns exceptions into statuses.
+#include "track/track.h"
+
+#include "error.h"
+#include "transmittance.h"
+#include "volume.h"
+
+#include <tbb/task_arena.h>
+
+#include <cmath>
+#include <cstring>
+#include <exception>
+#include <filesystem>
+#include <new>
+#include <string>
+#include <utility>
+
+struct TrkVolume {
+    trk::Volume volume;
+};
+
+namespace {
+
+thread_local std::string lastError;
+
+TrkStatus fail(TrkStatus status, const char* message) noexcept {
+    try {
+        lastError = message;
+    } catch (...) {
+        lastError.clear();  // no memory for the message; the status still tells
+    }
+    return status;
+}
+
+/// Runs `body`; no exception leaves.
+template <class Body>
+TrkStatus guard(const Body& body) noexcept {
+    try {
+        body();
+        return TRK_OK;
+    } catch (const trk::Error& e) {
+        return fail(e.status(), e.what());
+    } catch (const std::bad_alloc&) {
+        return fail(TRK_ERROR_OUT_OF_MEMORY, "the machine has no memory left for this call");
+    } catch (const std::filesystem::filesystem_error& e) {
+        return fail(TRK_ERROR_IO, e.what());
+    } catch (const std::exception& e) {
+        return fail(TRK_ERROR_UNKNOWN, e.what());
+    } catch (...) {
+        return fail(TRK_ERROR_UNKNOWN, "an exception that is not a std::exception");
+    }
+}
+
+[[noreturn]] void refuse(const std::string& message) {
+    throw trk::Error(TRK_ERROR_INVALID_ARGUMENT, message);
+}
+
+void checkSize(const char* what, size_t size, size_t expected) {
+    if (size != expected) {
+        refuse(std::string(what) + ".size is " + std::to_string(size) + "; expected " +
+               std::to_string(expected) + " (fill the struct with its trkDefault… function)");
+    }
+}
+
+trk::VolumeOptions checked(const TrkVolumeOptions& options) {
+    if (!(options.scale >= 0) || !std::isfinite(options.scale)) {
+        refuse("scale is " + std::to_string(options.scale) + "; expected a finite number >= 0");
+    }
+    if (options.choice < TRK_CHOICE_ROBUST || options.choice > TRK_CHOICE_MAX) {
+        refuse("choice is " + std::to_string(options.choice) + "; expected a TRK_CHOICE_ constant");
+    }
+    if (options.check != TRK_CHECK_FULL && options.check != TRK_CHECK_METADATA) {
+        refuse("check is " + std::to_string(options.check) + "; expected a TRK_CHECK_ constant");
+    }
+    if ((options.repair & ~uint32_t{TRK_REPAIR_DROP_NONFINITE | TRK_REPAIR_CLAMP_NEGATIVE}) != 0) {
+        refuse("repair has unknown bits; expected TRK_REPAIR_ constants");
+    }
+    if (options.threads < 0) {
+        refuse("threads is " + std::to_string(options.threads) + "; expected 0 (all) or more");
+    }
+    trk::VolumeOptions result;
+    result.gridNamed = options.gridName != nullptr;
+    result.gridName = options.gridName ? options.gridName : "";
+    result.scale = options.scale;
+    result.choice = options.choice;
+    result.check = options.check;
+    result.repair = options.repair;
+    result.maxMemory = options.maxMemory;
+    return result;
+}
+
+TrkQuery checked(const TrkQuery* given) {
+    if (given) {
+        checkSize("TrkQuery", given->size, sizeof(TrkQuery));
+    }
+    TrkQuery query = given ? *given : trkDefaultQuery();
+    if (query.method < TRK_METHOD_EXACT || query.method > TRK_METHOD_CONTROL) {
+        refuse("method is " + std::to_string(query.method) + "; expected a TRK_METHOD_ constant");
+    }
+    if (query.samples == 0) {
+        refuse("samples is 0; expected at least 1");
+    }
+    if (!(query.rate > 0) || !std::isfinite(query.rate)) {
+        refuse("rate is " + std::to_string(query.rate) + "; expected a finite number > 0");
+    }
+    if ((query.flags & ~uint32_t{TRK_QUERY_EXACT_FALLBACK}) != 0) {
+        refuse("flags has unknown bits; expected TRK_QUERY_ constants");
+    }
+    if (query.threads < 0) {
+        refuse("threads is " + std::to_string(query.threads) + "; expected 0 (all) or more");
+    }
+    if (query.rayStride == 0) {
+        query.rayStride = sizeof(TrkRay);
+    }
+    if (query.rayStride < sizeof(TrkRay) || query.rayStride % alignof(TrkRay) != 0) {
+        refuse("rayStride is " + std::to_string(query.rayStride) + "; expected a multiple of " +
+               std::to_string(alignof(TrkRay)) + " from " + std::to_string(sizeof(TrkRay)) + " on");
+    }
+    return query;
+}
+
+void checkPointers(const TrkVolume* volume, const void* rays, size_t rayCount,
+                   const void* results) {
+    if (!volume) {
+        refuse("volume is NULL");
+    }
+    if (rayCount > 0 && !rays) {
+        refuse("rays is NULL; expected " + std::to_string(rayCount) + " rays");
+    }
+    if (rayCount > 0 && !results) {
+        refuse("the result array is NULL; expected room for " + std::to_string(rayCount) + " rays");
+    }
+}
+
+}  // namespace
+
+const char* trkGetVersion(void) {
+    return TRACK_VERSION;
+}
+
+const char* trkGetLastErrorMessage(void) {
+    return lastError.c_str();
+}
+
+const char* trkGetStatusName(TrkStatus status) {
+    switch (status) {
+        case TRK_OK:
+            return "TRK_OK";
+        case TRK_ERROR_INVALID_ARGUMENT:
+            return "TRK_ERROR_INVALID_ARGUMENT";
+        case TRK_ERROR_IO:
+            return "TRK_ERROR_IO";
+        case TRK_ERROR_BAD_FILE:
+            return "TRK_ERROR_BAD_FILE";
+        case TRK_ERROR_GRID_NOT_FOUND:
+            return "TRK_ERROR_GRID_NOT_FOUND";
+        case TRK_ERROR_UNSUPPORTED_GRID:
+            return "TRK_ERROR_UNSUPPORTED_GRID";
+        case TRK_ERROR_BAD_DENSITY:
+            return "TRK_ERROR_BAD_DENSITY";
+        case TRK_ERROR_SIDECAR_MISMATCH:
+            return "TRK_ERROR_SIDECAR_MISMATCH";
+        case TRK_ERROR_NO_SIDECAR:
+            return "TRK_ERROR_NO_SIDECAR";
+        case TRK_ERROR_NO_DENSITY:
+            return "TRK_ERROR_NO_DENSITY";
+        case TRK_ERROR_OUT_OF_MEMORY:
+            return "TRK_ERROR_OUT_OF_MEMORY";
+        default:
+            return "TRK_ERROR_UNKNOWN";
+    }
+}
+
+TrkStatus trkOpenVolume(const char* vdbPath, const char* sidecarPath,
+                        const TrkVolumeOptions* options, TrkVolume** volume) {
+    return guard([&] {
+        if (!volume) {
+            refuse("volume is NULL; expected where to put the opened volume");
+        }
+        *volume = nullptr;
+        if (options) {
+            // Before the copy: a caller's older struct may be shorter than ours.
+            checkSize("TrkVolumeOptions", options->size, sizeof(TrkVolumeOptions));
+        }
+        const TrkVolumeOptions given = options ? *options : trkDefaultVolumeOptions();
+        const trk::VolumeOptions opened = checked(given);
+        const auto open = [&] {
+            *volume = new TrkVolume{trk::openVolume(vdbPath, sidecarPath, opened)};
+        };
+        if (given.threads == 0) {
+            tbb::this_task_arena::isolate(open);
+        } else {
+            tbb::task_arena(given.threads).execute(open);
+        }
+    });
+}
+
+void trkCloseVolume(TrkVolume* volume) {
+    delete volume;
+}
+
+TrkStatus trkGetVolumeInfo(const TrkVolume* handle, TrkVolumeInfo* info) {
+    return guard([&] {
+        if (!handle || !info) {
+            refuse("volume or info is NULL");
+        }
+        checkSize("TrkVolumeInfo", info->size, sizeof(TrkVolumeInfo));
+        const trk::Volume& volume = handle->volume;
+        TrkVolumeInfo result{};
+        result.size = sizeof(TrkVolumeInfo);
+        const trk::IntBox& box = volume.hasDensity ? volume.field.box() : volume.superVoxels.box();
+        for (int corner = 0; corner < 8 && !box.empty(); ++corner) {
+            trk::Vec3d index;
+            for (int a = 0; a < 3; ++a) {
+                const auto axis = static_cast<size_t>(a);
+                index[a] = static_cast<double>(volume.anchor[axis] +
+                                               (corner >> a & 1 ? box.hi[axis] : box.lo[axis]));
+            }
+            const trk::Vec3d world = volume.indexToWorld.point(index);
+            for (int a = 0; a < 3; ++a) {
+                result.boundsMin[a] =
+                    corner == 0 ? world[a] : std::min(result.boundsMin[a], world[a]);
+                result.boundsMax[a] =
+                    corner == 0 ? world[a] : std::max(result.boundsMax[a], world[a]);
+            }
+        }
+        for (int row = 0; row < 3; ++row) {
+            for (int column = 0; column < 3; ++column) {
+                result.indexToWorld[3 * row + column] = volume.indexToWorld.linear[row][column];
+            }
+            result.indexToWorld[9 + row] = volume.indexToWorld.translation[row];
+        }
+        result.activeVoxels = volume.activeVoxels;
+        result.bytes = volume.bytes();
+        result.channels = 1;
+        result.hasDensity = volume.hasDensity ? 1 : 0;
+        result.gridName = volume.grid.name.c_str();
+        result.controlKind = "";
+        result.storage = !volume.hasDensity ? "" : volume.field.isHalf() ? "half" : "float";
+        if (volume.hasSuperVoxels) {
+            result.superVoxelSize = static_cast<uint32_t>(volume.superVoxels.size());
+            result.superVoxelCount = static_cast<uint32_t>(volume.superVoxels.count());
+            result.levels = static_cast<uint32_t>(volume.superVoxels.levelCount());
+            result.controlKind = "constant";
+        }
+        *info = result;
+    });
+}
+
+TrkStatus trkEstimateTransmittance(const TrkVolume* volume, const TrkQuery* query,
+                                   const TrkRay* rays, size_t rayCount, float* transmittance,
+                                   TrkStatistics* statistics) {
+    return guard([&] {
+        checkPointers(volume, rays, rayCount, transmittance);
+        trk::estimateTransmittance(volume->volume, checked(query), rays, rayCount, transmittance,
+                                   statistics);
+    });
+}
+
+TrkStatus trkIntegrateOpticalDepth(const TrkVolume* volume, const TrkQuery* query,
+                                   const TrkRay* rays, size_t rayCount, double* opticalDepth) {
+    return guard([&] {
+        checkPointers(volume, rays, rayCount, opticalDepth);
+        const TrkQuery complete = checked(query);
+        if (complete.method != TRK_METHOD_EXACT && complete.method != TRK_METHOD_CONTROL) {
+            refuse("method " + std::to_string(complete.method) +
+                   " is random and has no optical depth; expected TRK_METHOD_EXACT or "
+                   "TRK_METHOD_CONTROL");
+        }
+        trk::integrateOpticalDepth(volume->volume, complete, rays, rayCount, opticalDepth);
+    });
+}

@@ -1,0 +1,22 @@
+// SPDX-License-Identifier: Apache-2.0
+// The one exception of the library: a status of the C API and the line its user reads.
+#pragma once
+
+#include "track/track.h"
+
+#include <stdexcept>
+#include <string>
+
+namespace trk {
+
+class Error : public std::runtime_error {
+  public:
+    Error(TrkStatus status, const std::string& message)
+        : std::runtime_error(message), status_(status) {}
+    TrkStatus status() const noexcept { return status_; }
+
+  private:
+    TrkStatus status_;
+};
+
+}  // namespace trk

@@ -1,0 +1,41 @@
+// SPDX-License-Identifier: Apache-2.0
+// A product of many weights that neither overflows nor underflows.
+#pragma once
+
+#include <cmath>
+#include <limits>
+
+namespace trk {
+
+/// Holds value x 2^exponent. The weights' product and the control's optical depth can both be
+/// extreme while what they make together is not, so the exponents meet before anything is rounded.
+class ScaledProduct {
+  public:
+    void multiply(double weight) {
+        value_ *= weight;
+        const double magnitude = std::fabs(value_);
+        if (magnitude > 0x1p500 || magnitude < 0x1p-500) {
+            int exponent = 0;
+            value_ = std::frexp(value_, &exponent);  // 0 stays 0
+            exponent_ += exponent;
+        }
+    }
+
+    bool isZero() const { return value_ == 0; }
+
+    /// product x exp(-opticalDepth), saturated at the range of float instead of infinite.
+    double timesExp(double opticalDepth) const {
+        constexpr double kLimit = static_cast<double>(std::numeric_limits<float>::max());
+        const double logScale = static_cast<double>(exponent_) * 0.69314718055994530942;
+        // Beyond +-1400 the exponential decides alone: |value_| lies within 2^+-500.
+        const double power = std::fmin(std::fmax(logScale - opticalDepth, -1400.0), 1400.0);
+        const double result = value_ * std::exp(0.5 * power) * std::exp(0.5 * power);
+        return std::fmin(std::fmax(result, -kLimit), kLimit);
+    }
+
+  private:
+    double value_ = 1;
+    long long exponent_ = 0;
+};
+
+}  // namespace trk

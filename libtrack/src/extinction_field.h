@@ -1,0 +1,150 @@
+// SPDX-License-Identifier: Apache-2.0
+// The density as the runtime sees it: bricks of 8^3 cells in a sparse table, each with the apron
+// that keeps all corners of a trilinear look-up in one brick.
+#pragma once
+
+#include "sparse_table.h"
+
+#include <cstddef>
+#include <cstdint>
+#include <cstring>
+#include <vector>
+
+namespace trk {
+
+/// Decodes an IEEE half that is finite and not negative. Integer arithmetic and one conversion, so
+/// that a host that flushes denormals to zero gets the same values.
+inline float decodeHalf(uint16_t half) {
+    if (half < 0x400) {
+        return static_cast<float>(half) * 0x1p-24f;
+    }
+    const uint32_t bits = (static_cast<uint32_t>(half) << 13) + (112u << 23);
+    float value;
+    std::memcpy(&value, &bits, sizeof(value));
+    return value;
+}
+
+/// Whether decodeHalf can return exactly `value` (finite, not negative).
+inline bool isExactHalf(float value) {
+    if (value == 0) {
+        return true;
+    }
+    if (value < 0x1p-14f) {
+        const float scaled = value * 0x1p24f;
+        return scaled == static_cast<float>(static_cast<uint32_t>(scaled));
+    }
+    uint32_t bits;
+    std::memcpy(&bits, &value, sizeof(bits));
+    return (bits & 0x1fff) == 0 && value <= 65504.0f;
+}
+
+/// The half that decodeHalf turns into `value`, for which isExactHalf holds.
+inline uint16_t encodeHalf(float value) {
+    if (value < 0x1p-14f) {
+        return static_cast<uint16_t>(value * 0x1p24f);
+    }
+    uint32_t bits;
+    std::memcpy(&bits, &value, sizeof(bits));
+    return static_cast<uint16_t>((bits - (112u << 23)) >> 13);
+}
+
+/// Trilinear density over local space: voxel centres at integer coordinates, 0 outside. Immutable.
+///
+/// A brick at b covers the cells b..b+7 per axis, hence the vertices b..b+8. Bricks whose vertices
+/// all agree are not stored: their entry is a constant, and so are larger regions. All values are
+/// finite and not negative. Storage is half where that is exact for every value.
+class ExtinctionField {
+  public:
+    using Entry = SparseTable::Entry;
+
+    static constexpr int kBrickShift = 3;
+    static constexpr int64_t kBrickSize = 8;
+    static constexpr size_t kBrickEdge = 9;
+    static constexpr size_t kBrickVertices = kBrickEdge * kBrickEdge * kBrickEdge;
+    static constexpr Entry kConstantFlag = 0x40000000u;  ///< else: index of a brick, plus one
+
+    ExtinctionField() = default;
+
+    /// Bricks lie one after another in `floats` or `halfs`, x slowest; the other one is empty.
+    ExtinctionField(SparseTable table, std::vector<float> constants, std::vector<float> floats,
+                    std::vector<uint16_t> halfs);
+
+    /// Box of the occupied bricks and tiles, in cells; nothing but 0 lies outside.
+    const IntBox& box() const { return box_; }
+    bool isHalf() const { return !halfs_.empty(); }
+    size_t bytes() const;
+    size_t brickCount() const { return (floats_.size() + halfs_.size()) / kBrickVertices; }
+    const SparseTable& table() const { return table_; }
+
+    /// Value of an entry that is empty or has the constant flag.
+    float constant(Entry entry) const {
+        return entry == SparseTable::kEmpty ? 0.0f : constants_[entry & ~kConstantFlag];
+    }
+    static bool isConstant(Entry entry) {
+        return entry == SparseTable::kEmpty || (entry & kConstantFlag) != 0;
+    }
+    /// Copies the vertices of brick `entry` to `out`.
+    void copyBrick(Entry entry, float (&out)[kBrickVertices]) const;
+
+    /// Density at a point of local space (its coordinates not negative).
+    float density(const Vec3d& point) const {
+        const auto x = static_cast<int64_t>(point[0]);
+        const auto y = static_cast<int64_t>(point[1]);
+        const auto z = static_cast<int64_t>(point[2]);
+        const Entry entry = table_.find(x, y, z).entry;
+        if (isConstant(entry)) {
+            return constant(entry);
+        }
+        const size_t vertex =
+            (entry - 1) * kBrickVertices +
+            (static_cast<size_t>(x & 7) * kBrickEdge + static_cast<size_t>(y & 7)) * kBrickEdge +
+            static_cast<size_t>(z & 7);
+        const auto fx = static_cast<float>(point[0] - static_cast<double>(x));
+        const auto fy = static_cast<float>(point[1] - static_cast<double>(y));
+        const auto fz = static_cast<float>(point[2] - static_cast<double>(z));
+        return isHalf() ? interpolate<float>(Corners<float>(&halfs_[vertex]), fx, fy, fz)
+                        : interpolate<float>(Corners<float>(&floats_[vertex]), fx, fy, fz);
+    }
+
+    /// Integral of the density over [t0, t1] of the ray, in voxel lengths, by the closed form of
+    /// each cell: along a line a trilinear field is a cubic there, for which two Gauss points are
+    /// exact. Adds two look-ups a cell to `lookups` and the bricks and tiles met to `regions`.
+    double integrate(const LocalRay& ray, double t0, double t1, uint64_t& lookups,
+                     uint64_t& regions) const;
+
+  private:
+    template <class Real>
+    struct Corners {
+        Real v[8];
+
+        template <class Stored>
+        explicit Corners(const Stored* p)
+            : v{load(p[0]),  load(p[1]),  load(p[9]),  load(p[10]),
+                load(p[81]), load(p[82]), load(p[90]), load(p[91])} {}
+        static Real load(float value) { return value; }
+        static Real load(uint16_t half) { return decodeHalf(half); }
+    };
+
+    template <class Real>
+    static Real interpolate(const Corners<Real>& c, Real fx, Real fy, Real fz) {
+        const Real v00 = c.v[0] + fz * (c.v[1] - c.v[0]);
+        const Real v01 = c.v[2] + fz * (c.v[3] - c.v[2]);
+        const Real v10 = c.v[4] + fz * (c.v[5] - c.v[4]);
+        const Real v11 = c.v[6] + fz * (c.v[7] - c.v[6]);
+        const Real v0 = v00 + fy * (v01 - v00);
+        const Real v1 = v10 + fy * (v11 - v10);
+        return v0 + fx * (v1 - v0);
+    }
+
+    template <class Stored>
+    static double integrateBrick(const Stored* brick, const Int3& lo, const LocalRay& ray,
+                                 double t0, double t1, uint64_t& lookups);
+
+    SparseTable table_;
+    std::vector<float> constants_;
+    std::vector<float> floats_;
+    std::vector<uint16_t> halfs_;
+    IntBox box_;
+};
+
+}  // namespace trk

@@ -1,0 +1,147 @@
+// SPDX-License-Identifier: Apache-2.0
+#include "density.h"
+
+#include "../error.h"
+#include "field_builder.h"
+#include "vdb_file.h"
+
+#include <sstream>
+#include <utility>
+#include <vector>
+
+namespace trk {
+namespace {
+
+bool isScalar(const std::string& type) {
+    return type == openvdb::FloatTree::treeType() || type == openvdb::DoubleTree::treeType();
+}
+
+/// "Tree_vec3s_5_4_3" -> "vec3s".
+std::string valueTypeName(const std::string& type) {
+    const size_t first = type.find('_');
+    const size_t last = type.find('_', first + 1);
+    return first == std::string::npos ? type : type.substr(first + 1, last - first - 1);
+}
+
+/// The grid asked for, or the only one that can be a density, else "density".
+const VdbEntry& choose(VdbFile& file, const DensityOptions& options) {
+    if (file.entries().empty()) {
+        throw Error(TRK_ERROR_GRID_NOT_FOUND, file.path() + ": the file has no grids");
+    }
+    if (options.gridNamed) {
+        return file.select(options.gridName);
+    }
+    std::vector<const VdbEntry*> candidates;
+    bool hasDensity = false;
+    for (const VdbEntry& entry : file.entries()) {
+        if (!isScalar(entry.type)) {
+            continue;
+        }
+        const openvdb::GridClass gridClass = file.readMetadata(entry)->getGridClass();
+        if (gridClass == openvdb::GRID_FOG_VOLUME || gridClass == openvdb::GRID_UNKNOWN) {
+            candidates.push_back(&entry);
+            hasDensity = hasDensity || entry.name == "density";
+        }
+    }
+    if (candidates.size() == 1) {
+        return *candidates[0];
+    }
+    if (hasDensity) {
+        return file.select("density");
+    }
+    if (candidates.empty() && file.entries().size() == 1) {
+        return file.entries()[0];  // whose refusal says more than a list of one
+    }
+    throw Error(TRK_ERROR_GRID_NOT_FOUND,
+                file.path() +
+                    (candidates.empty() ? ": no grid can be a density"
+                                        : ": several grids can be the density") +
+                    "; choose one by name; the file has " + file.listing());
+}
+
+void checkKind(const VdbEntry& entry, const openvdb::GridBase* grid, const std::string& where) {
+    const auto refuse = [&](const std::string& found) {
+        throw Error(TRK_ERROR_UNSUPPORTED_GRID,
+                    where + ": is " + found + "; expected a float or double fog volume");
+    };
+    if (!grid || !isScalar(entry.type)) {
+        refuse("of type " + valueTypeName(entry.type));
+    }
+    switch (grid->getGridClass()) {
+        case openvdb::GRID_LEVEL_SET:
+            refuse("a level set");
+            break;
+        case openvdb::GRID_STAGGERED:
+            refuse("staggered");
+            break;
+        default:
+            break;
+    }
+}
+
+void checkValues(const TreeScan& scan, double background, uint32_t repair,
+                 const std::string& where) {
+    if (!(background == 0)) {
+        std::ostringstream line;
+        line << where << ": background is " << background
+             << "; expected 0, or the extinction has no end";
+        throw Error(TRK_ERROR_BAD_DENSITY, line.str());
+    }
+    const auto refuse = [&](const BadValues& bad, const char* kind, const char* option) {
+        std::ostringstream line;
+        line << where << ": " << bad.count << (bad.count == 1 ? " voxel is " : " voxels are ")
+             << kind << ", the first at index (" << bad.first[0] << ", " << bad.first[1] << ", "
+             << bad.first[2] << "); expected finite values >= 0 (" << option << " makes them 0)";
+        throw Error(TRK_ERROR_BAD_DENSITY, line.str());
+    };
+    if (scan.nonfinite.count > 0 && !(repair & TRK_REPAIR_DROP_NONFINITE)) {
+        refuse(scan.nonfinite, "NaN or infinite", "--drop-nonfinite");
+    }
+    if (scan.negative.count > 0 && !(repair & TRK_REPAIR_CLAMP_NEGATIVE)) {
+        refuse(scan.negative, "negative", "--clamp-negative");
+    }
+}
+
+template <class GridType>
+Density convert(const GridType& grid, const DensityOptions& options, const std::string& where) {
+    Density density;
+    DensitySummary& summary = density.summary;
+    const FieldBuilder<typename GridType::TreeType> builder(grid.constTree());
+    const TreeScan& scan = builder.scan();
+    checkValues(scan, static_cast<double>(grid.background()), options.repair, where);
+    summary.digest = scan.digest;
+    summary.activeVoxels = scan.activeVoxels;
+    summary.gridBytes = grid.memUsage();
+    summary.min = scan.min;
+    summary.max = scan.max;
+    summary.repair = options.repair;
+    summary.dropped = scan.nonfinite.count;
+    summary.clamped = scan.negative.count;
+    summary.anchor = anchorFor(scan.box);
+    density.field = builder.build(summary.anchor, options.maxMemory, where);
+    return density;
+}
+
+}  // namespace
+
+Density loadDensity(const std::string& path, const DensityOptions& options) {
+    VdbFile file(path);
+    const VdbEntry& entry = choose(file, options);
+    const std::string where = path + ": grid " + entry.label();
+    const openvdb::GridBase::Ptr metadata = file.readMetadata(entry);
+    checkKind(entry, metadata.get(), where);
+    const AffineMap map = affineMap(metadata->constTransform(), where);
+
+    openvdb::GridBase::Ptr grid = file.read(entry, options.maxMemory);
+    const bool isDouble = entry.type == openvdb::DoubleTree::treeType();
+    Density density = isDouble
+                          ? convert(static_cast<const openvdb::DoubleGrid&>(*grid), options, where)
+                          : convert(static_cast<const openvdb::FloatGrid&>(*grid), options, where);
+    density.summary.path = path;
+    density.summary.grid = {entry.name, entry.index};
+    density.summary.valueType = isDouble ? "double" : "float";
+    density.summary.indexToWorld = map;
+    return density;
+}
+
+}  // namespace trk

@@ -1,0 +1,47 @@
+// SPDX-License-Identifier: Apache-2.0
+// The one loader, for baking and for queries: a grid of a .vdb file becomes an extinction field.
+#pragma once
+
+#include "../extinction_field.h"
+#include "../math.h"
+#include "../volume.h"
+
+#include <cstdint>
+#include <string>
+
+namespace trk {
+
+struct DensityOptions {
+    bool gridNamed = false;
+    std::string gridName;    ///< NAME or NAME[i], where gridNamed
+    uint32_t repair = 0;     ///< TRK_REPAIR_… bits
+    uint64_t maxMemory = 0;  ///< 0: no limit
+};
+
+/// What is known of a source grid besides its values.
+struct DensitySummary {
+    std::string path;
+    GridIdentity grid;
+    std::string valueType;  ///< "float" or "double"
+    AffineMap indexToWorld;
+    Int3 anchor{{0, 0, 0}};
+    uint64_t digest = 0;  ///< of origins, levels, masks and values as stored, before any repair
+    uint64_t activeVoxels = 0;
+    uint64_t gridBytes = 0;  ///< what OpenVDB held for the grid
+    float min = 0;           ///< smallest and largest value that is not background
+    float max = 0;
+    uint32_t repair = 0;  ///< the repairs allowed
+    uint64_t dropped = 0;
+    uint64_t clamped = 0;
+};
+
+struct Density {
+    DensitySummary summary;
+    ExtinctionField field;  ///< in local space: index space minus summary.anchor
+};
+
+/// Loads, checks and converts a grid, in parallel. Without a name: the only scalar grid that could
+/// be a density, else "density". Throws Error.
+Density loadDensity(const std::string& path, const DensityOptions& options);
+
+}  // namespace trk

@@ -1,0 +1,443 @@
+// SPDX-License-Identifier: Apache-2.0
+// From an OpenVDB tree to bricks: one scan of the leaves (checks, digest, extent), then bricks
+// wherever a vertex is not constant. Work and memory go with the leaves, not with tiles or boxes.
+#pragma once
+
+#include "../error.h"
+#include "../extinction_field.h"
+#include "tree_regions.h"
+
+#include <openvdb/openvdb.h>
+#include <tbb/blocked_range.h>
+#include <tbb/parallel_for.h>
+#include <tbb/parallel_reduce.h>
+
+#include <algorithm>
+#include <array>
+#include <cmath>
+#include <cstring>
+#include <map>
+#include <string>
+#include <vector>
+
+namespace trk {
+
+struct BadValues {
+    uint64_t count = 0;
+    Int3 first{{0, 0, 0}};
+
+    void add(uint64_t n, const Int3& at) {
+        if (n > 0) {
+            first = count == 0 ? at : std::min(first, at);
+            count += n;
+        }
+    }
+};
+
+/// What one pass over a tree's leaves and tiles found.
+struct TreeScan {
+    BadValues negative;
+    BadValues nonfinite;
+    uint64_t digest = 0;
+    uint64_t activeVoxels = 0;
+    bool exactHalfs = true;
+    bool any = false;  ///< min and max are of something
+    float min = 0;
+    float max = 0;
+    IntBox box;  ///< index space; cells where the trilinear field may differ from 0
+
+    void addRange(float lo, float hi) {
+        min = any ? std::min(min, lo) : lo;
+        max = any ? std::max(max, hi) : hi;
+        any = true;
+    }
+    void join(const TreeScan& o) {
+        negative.add(o.negative.count, o.negative.first);
+        nonfinite.add(o.nonfinite.count, o.nonfinite.first);
+        digest += o.digest;
+        activeVoxels += o.activeVoxels;
+        exactHalfs = exactHalfs && o.exactHalfs;
+        if (o.any) {
+            addRange(o.min, o.max);
+        }
+        if (!o.box.empty()) {
+            box.add(o.box.lo, o.box.hi);
+        }
+    }
+};
+
+/// 64-bit hash of a block of words: four lanes of multiply and rotate (the construction of
+/// xxHash64), so that it keeps up with memory.
+inline uint64_t hashWords(const void* data, size_t wordCount, uint64_t seed) {
+    constexpr uint64_t kP1 = 0x9e3779b185ebca87u;
+    constexpr uint64_t kP2 = 0xc2b2ae3d27d4eb4fu;
+    const auto rotate = [](uint64_t x, int n) { return x << n | x >> (64 - n); };
+    uint64_t lane[4] = {seed + kP1 + kP2, seed + kP2, seed, seed - kP1};
+    const auto* bytes = static_cast<const unsigned char*>(data);
+    for (size_t i = 0; i < wordCount; ++i) {
+        uint64_t word;
+        std::memcpy(&word, bytes + 8 * i, 8);
+        lane[i & 3] = rotate(lane[i & 3] + word * kP2, 31) * kP1;
+    }
+    uint64_t h = seed ^ wordCount;
+    for (const uint64_t l : lane) {
+        h = (h ^ (rotate(l * kP2, 31) * kP1)) * kP1 + kP2;
+    }
+    h ^= h >> 33;
+    h *= kP2;
+    h ^= h >> 29;
+    return h;
+}
+
+template <class TreeType>
+class FieldBuilder {
+  public:
+    using Leaf = typename TreeType::LeafNodeType;
+    using Value = typename TreeType::ValueType;
+    using Entry = SparseTable::Entry;
+
+    explicit FieldBuilder(const TreeType& tree) : tree_(tree) { scanTree(); }
+
+    const TreeScan& scan() const { return scan_; }
+
+    /// The field, in space relative to `anchor`; values that are negative or not finite count as 0.
+    /// Throws OUT_OF_MEMORY where the bricks would take more than `maxMemory` bytes (0: no limit).
+    ExtinctionField build(const Int3& anchor, uint64_t maxMemory, const std::string& where) const;
+
+  private:
+    static constexpr size_t kBrickVertices = ExtinctionField::kBrickVertices;
+    using Regions = TreeRegions<TreeType>;
+    using Vertices = std::array<float, kBrickVertices>;
+    using CornerValues = std::array<float, 8>;
+
+    struct Tile {
+        openvdb::Coord origin;
+        int shift;
+        Value value;
+        bool active;
+    };
+
+    /// A brick to fill: from the tree around `origin` (index space), or, where all eight regions it
+    /// reaches into are tiles, from their values.
+    struct Job {
+        Int3 origin;
+        bool fromTiles;
+        CornerValues values;
+    };
+
+    /// What the recursion of build() works on.
+    struct Plan {
+        SparseTable table;
+        std::vector<Job> jobs;
+        std::vector<float> constants;
+        std::map<float, Entry> constantEntries;
+        std::map<std::pair<int, CornerValues>, Entry> shared;
+
+        Entry constantEntry(float value) {
+            if (value == 0) {
+                return SparseTable::kEmpty;
+            }
+            const auto [it, isNew] = constantEntries.try_emplace(
+                value, static_cast<Entry>(constants.size()) | ExtinctionField::kConstantFlag);
+            if (isNew) {
+                constants.push_back(value);
+            }
+            return it->second;
+        }
+        Entry jobEntry(const Job& job) {
+            jobs.push_back(job);
+            return static_cast<Entry>(jobs.size());
+        }
+        /// Entry for a region whose own value and those of its seven upper neighbours are constant.
+        /// Such regions look alike all over the surface of a tile, so they are built once.
+        Entry sharedEntry(int shift, const CornerValues& values) {
+            if (std::all_of(values.begin(), values.end(),
+                            [&](float v) { return v == values[0]; })) {
+                return constantEntry(values[0]);
+            }
+            const auto key = std::make_pair(shift, values);
+            if (const auto it = shared.find(key); it != shared.end()) {
+                return it->second;
+            }
+            Entry entry;
+            if (shift == ExtinctionField::kBrickShift) {
+                entry = jobEntry({Int3{{0, 0, 0}}, true, values});
+            } else {
+                SparseTable::Node node;
+                for (size_t c = 0; c < node.size(); ++c) {
+                    CornerValues child;
+                    for (size_t corner = 0; corner < 8; ++corner) {
+                        // The last child of an axis looks into the upper neighbour.
+                        const size_t x = (c >> 6) + (corner >> 2) > 7 ? 4 : 0;
+                        const size_t y = (c >> 3 & 7) + (corner >> 1 & 1) > 7 ? 2 : 0;
+                        const size_t z = (c & 7) + (corner & 1) > 7 ? 1 : 0;
+                        child[corner] = values[x + y + z];
+                    }
+                    node[c] = sharedEntry(shift - 3, child);
+                }
+                entry = table.addNode(node);
+            }
+            shared.emplace(key, entry);
+            return entry;
+        }
+    };
+
+    /// The value as the field holds it: repaired, float, without negative zero.
+    static float fieldValue(Value value) {
+        const auto v = static_cast<float>(value);
+        return v > 0 && std::isfinite(v) ? v : 0.0f;
+    }
+
+    static void scanValue(Value value, const openvdb::Coord& at, uint64_t count, TreeScan& scan) {
+        const auto v = static_cast<float>(value);
+        const Int3 where{{at.x(), at.y(), at.z()}};
+        if (!std::isfinite(v)) {  // a double beyond float's range is infinite to the field
+            scan.nonfinite.add(count, where);
+        } else if (v < 0) {
+            scan.negative.add(count, where);
+        }
+        const float f = fieldValue(value);
+        scan.addRange(f, f);
+        scan.exactHalfs = scan.exactHalfs && isExactHalf(f);
+    }
+
+    static void addSupport(const openvdb::Coord& origin, int64_t size, TreeScan& scan) {
+        const Int3 o{{origin.x(), origin.y(), origin.z()}};
+        scan.box.add({{o[0] - 1, o[1] - 1, o[2] - 1}}, {{o[0] + size, o[1] + size, o[2] + size}});
+    }
+
+    static void scanLeaf(const Leaf& leaf, TreeScan& scan);
+    static void scanTile(const Tile& tile, TreeScan& scan);
+    void scanTree();
+
+    static void gather(Regions& regions, const Job& job, Vertices& out);
+    static void gatherCorner(const Leaf* leaf, float value, size_t corner, Vertices& out);
+
+    const TreeType& tree_;
+    std::vector<const Leaf*> leaves_;
+    std::vector<Tile> tiles_;
+    TreeScan scan_;
+};
+
+template <class TreeType>
+void FieldBuilder<TreeType>::scanLeaf(const Leaf& leaf, TreeScan& scan) {
+    const Value* values = leaf.buffer().data();
+    const openvdb::Coord origin = leaf.origin();
+    uint64_t mask[8];
+    for (openvdb::Index w = 0; w < 8; ++w) {
+        mask[w] = leaf.valueMask().template getWord<uint64_t>(w);
+    }
+    const int32_t key[4] = {origin.x(), origin.y(), origin.z(), 0};
+    scan.digest +=
+        hashWords(values, Leaf::SIZE * sizeof(Value) / 8, hashWords(mask, 8, hashWords(key, 2, 0)));
+    scan.activeVoxels += leaf.onVoxelCount();
+
+    // First branch-free over all, as nearly every leaf is fine; then, where not, voxel by voxel.
+    bool fine = true;
+    auto lo = static_cast<float>(values[0]);
+    float hi = lo;
+    for (openvdb::Index i = 0; i < Leaf::SIZE; ++i) {
+        const auto v = static_cast<float>(values[i]);
+        fine = fine & (v >= 0) & (v <= std::numeric_limits<float>::max());
+        lo = std::min(lo, v);
+        hi = std::max(hi, v);
+    }
+    if (fine) {
+        scan.addRange(lo, hi);
+        for (openvdb::Index i = 0; i < Leaf::SIZE && scan.exactHalfs; ++i) {
+            scan.exactHalfs = isExactHalf(static_cast<float>(values[i]));
+        }
+    } else {
+        for (openvdb::Index i = 0; i < Leaf::SIZE; ++i) {
+            scanValue(values[i], leaf.offsetToGlobalCoord(i), 1, scan);
+        }
+    }
+    if (hi > 0 || !fine) {
+        addSupport(origin, Leaf::DIM, scan);
+    }
+}
+
+template <class TreeType>
+void FieldBuilder<TreeType>::scanTile(const Tile& tile, TreeScan& scan) {
+    const int64_t size = int64_t{1} << tile.shift;
+    const auto voxels = static_cast<uint64_t>(size * size * size);
+    const int32_t key[4] = {tile.origin.x(), tile.origin.y(), tile.origin.z(), tile.shift};
+    const double value[2] = {static_cast<double>(tile.value), tile.active ? 1.0 : 0.0};
+    scan.digest += hashWords(value, 2, hashWords(key, 2, 1));
+    scan.activeVoxels += tile.active ? voxels : 0;
+    scanValue(tile.value, tile.origin, voxels, scan);
+    if (!(tile.value == 0)) {
+        addSupport(tile.origin, size, scan);
+    }
+}
+
+template <class TreeType>
+void FieldBuilder<TreeType>::scanTree() {
+    const auto addTile = [&](const openvdb::Coord& origin, int shift, Value value, bool active) {
+        if (active || !(value == 0)) {
+            tiles_.push_back({origin, shift, value, active});
+        }
+    };
+    for (auto root = tree_.root().cbeginChildAll(); root; ++root) {
+        Value value{};
+        const auto* upper = root.probeChild(value);
+        if (!upper) {
+            addTile(root.getCoord(), 12, value, root.isValueOn());
+            continue;
+        }
+        for (auto u = upper->cbeginChildAll(); u; ++u) {
+            const auto* lower = u.probeChild(value);
+            if (!lower) {
+                addTile(u.getCoord(), 7, value, u.isValueOn());
+                continue;
+            }
+            for (auto l = lower->cbeginChildAll(); l; ++l) {
+                if (const Leaf* leaf = l.probeChild(value)) {
+                    leaves_.push_back(leaf);
+                } else {
+                    addTile(l.getCoord(), 3, value, l.isValueOn());
+                }
+            }
+        }
+    }
+    scan_ = tbb::parallel_reduce(
+        tbb::blocked_range<size_t>(0, leaves_.size(), 64), TreeScan{},
+        [&](const tbb::blocked_range<size_t>& range, TreeScan part) {
+            for (size_t i = range.begin(); i != range.end(); ++i) {
+                scanLeaf(*leaves_[i], part);
+            }
+            return part;
+        },
+        [](TreeScan a, const TreeScan& b) {
+            a.join(b);
+            return a;
+        });
+    for (const Tile& tile : tiles_) {
+        scanTile(tile, scan_);
+    }
+}
+
+template <class TreeType>
+void FieldBuilder<TreeType>::gatherCorner(const Leaf* leaf, float value, size_t corner,
+                                          Vertices& out) {
+    // The brick's own region gives 8 vertices an axis, an upper neighbour the one of the apron.
+    const size_t nx = corner & 4 ? 1 : 8;
+    const size_t ny = corner & 2 ? 1 : 8;
+    const size_t nz = corner & 1 ? 1 : 8;
+    const size_t first =
+        (corner & 4 ? 8 * 81 : 0) + (corner & 2 ? 8 * 9 : 0) + (corner & 1 ? 8 : 0);
+    const Value* values = leaf ? leaf->buffer().data() : nullptr;
+    for (size_t x = 0; x < nx; ++x) {
+        for (size_t y = 0; y < ny; ++y) {
+            float* row = &out[first + x * 81 + y * 9];
+            for (size_t z = 0; z < nz; ++z) {
+                row[z] = values ? fieldValue(values[x << 6 | y << 3 | z]) : value;
+            }
+        }
+    }
+}
+
+template <class TreeType>
+void FieldBuilder<TreeType>::gather(Regions& regions, const Job& job, Vertices& out) {
+    for (size_t corner = 0; corner < 8; ++corner) {
+        if (job.fromTiles) {
+            gatherCorner(nullptr, job.values[corner], corner, out);
+            continue;
+        }
+        const Int3 at{{job.origin[0] + (corner & 4 ? 8 : 0), job.origin[1] + (corner & 2 ? 8 : 0),
+                       job.origin[2] + (corner & 1 ? 8 : 0)}};
+        const Leaf* leaf = regions.leaf(at);
+        gatherCorner(leaf, leaf ? 0.0f : fieldValue(regions.value(at)), corner, out);
+    }
+}
+
+template <class TreeType>
+ExtinctionField FieldBuilder<TreeType>::build(const Int3& anchor, uint64_t maxMemory,
+                                              const std::string& where) const {
+    Plan plan;
+    IntBox box;
+    if (!scan_.box.empty()) {
+        for (size_t a = 0; a < 3; ++a) {
+            box.lo[a] = scan_.box.lo[a] - anchor[a];
+            box.hi[a] = scan_.box.hi[a] - anchor[a];
+        }
+    }
+    plan.table = SparseTable(ExtinctionField::kBrickShift, box);
+    Regions regions(tree_);
+    plan.table.fill(
+        [&](const Int3& local, int shift) -> std::optional<Entry> {
+            CornerValues values{};
+            const int64_t size = int64_t{1} << shift;
+            for (size_t corner = 0; corner < 8; ++corner) {
+                const Int3 at{{anchor[0] + local[0] + (corner & 4 ? size : 0),
+                               anchor[1] + local[1] + (corner & 2 ? size : 0),
+                               anchor[2] + local[2] + (corner & 1 ? size : 0)}};
+                const auto region = regions.uniform(at, shift);
+                if (!region) {
+                    return std::nullopt;
+                }
+                values[corner] = fieldValue(region->value);
+            }
+            return plan.sharedEntry(shift, values);
+        },
+        [&](const Int3& local) {
+            return plan.jobEntry(
+                {{{anchor[0] + local[0], anchor[1] + local[1], anchor[2] + local[2]}}, false, {}});
+        });
+
+    // First pass: which bricks are constant after all. Second: fill the others, exactly allocated.
+    const size_t jobCount = plan.jobs.size();
+    const auto forEachJob = [&](const auto& body) {
+        tbb::parallel_for(tbb::blocked_range<size_t>(0, jobCount, 64),
+                          [&](const tbb::blocked_range<size_t>& range) {
+                              Regions local(tree_);
+                              Vertices vertices;
+                              for (size_t i = range.begin(); i != range.end(); ++i) {
+                                  gather(local, plan.jobs[i], vertices);
+                                  body(i, vertices);
+                              }
+                          });
+    };
+    constexpr float kNotConstant = -1;
+    std::vector<float> constantOf(jobCount);
+    forEachJob([&](size_t i, const Vertices& vertices) {
+        const bool same = std::all_of(vertices.begin(), vertices.end(),
+                                      [&](float v) { return v == vertices[0]; });
+        constantOf[i] = same ? vertices[0] : kNotConstant;
+    });
+    std::vector<Entry> entryOf(jobCount);
+    size_t brickCount = 0;
+    for (size_t i = 0; i < jobCount; ++i) {
+        entryOf[i] = constantOf[i] == kNotConstant ? static_cast<Entry>(++brickCount)
+                                                   : plan.constantEntry(constantOf[i]);
+    }
+    const size_t valueCount = brickCount * kBrickVertices;
+    const uint64_t wanted = valueCount * (scan_.exactHalfs ? 2 : 4);
+    if (maxMemory > 0 && wanted > maxMemory) {
+        throw Error(TRK_ERROR_OUT_OF_MEMORY, where + ": needs " + std::to_string(wanted) +
+                                                 " bytes for its bricks, more than maxMemory = " +
+                                                 std::to_string(maxMemory));
+    }
+    if (brickCount >= ExtinctionField::kConstantFlag) {
+        throw Error(TRK_ERROR_OUT_OF_MEMORY, where + ": has more than 2^30 bricks of 8^3 voxels");
+    }
+    std::vector<float> floats(scan_.exactHalfs ? 0 : valueCount);
+    std::vector<uint16_t> halfs(scan_.exactHalfs ? valueCount : 0);
+    forEachJob([&](size_t i, const Vertices& vertices) {
+        if (constantOf[i] != kNotConstant) {
+            return;
+        }
+        const size_t first = (entryOf[i] - 1) * kBrickVertices;
+        if (scan_.exactHalfs) {
+            std::transform(vertices.begin(), vertices.end(), &halfs[first], encodeHalf);
+        } else {
+            std::copy(vertices.begin(), vertices.end(), &floats[first]);
+        }
+    });
+    SparseTable table = plan.table.mapped([&](Entry entry) {
+        return entry & ExtinctionField::kConstantFlag ? entry : entryOf[entry - 1];
+    });
+    return {std::move(table), std::move(plan.constants), std::move(floats), std::move(halfs)};
+}
+
+}  // namespace trk

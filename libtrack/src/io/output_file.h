@@ -1,0 +1,39 @@
+// SPDX-License-Identifier: Apache-2.0
+// Files that appear whole or not at all.
+#pragma once
+
+#include <string>
+
+namespace trk {
+
+/// A file being written. It has no name until commit(), so that neither an error nor a kill leaves
+/// a part of it behind; where the file system cannot do that, it lies beside the target under a
+/// temporary name, which the destructor and cleanUpOutputFiles() remove.
+class OutputFile {
+  public:
+    /// Throws Error (IO): the folder is missing or read-only, the target is a directory, or it
+    /// exists and `force` is false.
+    OutputFile(std::string target, bool force);
+    ~OutputFile();
+    OutputFile(const OutputFile&) = delete;
+    OutputFile& operator=(const OutputFile&) = delete;
+
+    /// Path to open for writing until commit().
+    const std::string& path() const { return path_; }
+    const std::string& target() const { return target_; }
+
+    /// Flushes to disk and gives the file its name. Throws Error (IO); the old file is then intact.
+    void commit();
+
+  private:
+    std::string target_;
+    std::string path_;
+    std::string temporaryName_;  // empty while the file has none
+    bool force_;
+    int descriptor_ = -1;
+};
+
+/// Removes temporary files of this process. Async-signal-safe: for handlers that end the process.
+void cleanUpOutputFiles();
+
+}  // namespace trk

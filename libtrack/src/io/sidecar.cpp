@@ -1,0 +1,589 @@
+// SPDX-License-Identifier: Apache-2.0
+#include "sidecar.h"
+
+#include "../error.h"
+#include "tree_regions.h"
+#include "vdb_file.h"
+
+#include <openvdb/io/Archive.h>
+#include <openvdb/io/GridDescriptor.h>
+#include <openvdb/io/io.h>
+#include <openvdb/tools/Prune.h>
+
+#include <cmath>
+#include <cstdio>
+#include <filesystem>
+#include <fstream>
+#include <functional>
+#include <utility>
+#include <vector>
+
+namespace trk {
+namespace {
+
+constexpr int kFormatMajor = 1;
+constexpr const char* kFormat = "1.0";
+constexpr const char* kInterpolation = "trilinear";
+
+/// The grids of statistics, in the order written, and where their values live.
+struct Statistic {
+    const char* suffix;
+    float BakedSuperVoxel::*value;
+};
+constexpr Statistic kStatistics[] = {
+    {"_control", &BakedSuperVoxel::control}, {"_majorant", &BakedSuperVoxel::majorant},
+    {"_rms", &BakedSuperVoxel::rms},         {"_min", &BakedSuperVoxel::min},
+    {"_max", &BakedSuperVoxel::max},
+};
+
+std::string gridPrefix(const std::string& source) {
+    return source.empty() ? "density" : source;
+}
+
+std::string levelSuffix(int level) {
+    return "_control_level_" + std::to_string(level);
+}
+
+std::string hexDigest(uint64_t digest) {
+    char text[17];
+    std::snprintf(text, sizeof(text), "%016llx", static_cast<unsigned long long>(digest));
+    return text;
+}
+
+/// Index i of a grid of super-voxels of `size` lies at source index size i + size / 2.
+AffineMap superVoxelMap(const AffineMap& source, int size) {
+    AffineMap map = source;
+    const double centre = size / 2.0;
+    const Vec3d shift = source.vector({{centre, centre, centre}});
+    for (int row = 0; row < 3; ++row) {
+        for (int column = 0; column < 3; ++column) {
+            map.linear[row][column] *= size;
+        }
+        map.translation[row] += shift[row];
+    }
+    return map;
+}
+
+AffineMap sourceMap(const AffineMap& superVoxels, int size) {
+    AffineMap map = superVoxels;
+    for (auto& row : map.linear) {
+        for (double& value : row) {
+            value /= size;
+        }
+    }
+    const double centre = size / 2.0;
+    const Vec3d shift = map.vector({{centre, centre, centre}});
+    for (int row = 0; row < 3; ++row) {
+        map.translation[row] -= shift[row];
+    }
+    return map;
+}
+
+/// Equal up to the rounding of a few operations, measured where the volume is.
+bool sameMap(const AffineMap& a, const AffineMap& b) {
+    for (int row = 0; row < 3; ++row) {
+        double size = 0;
+        for (int column = 0; column < 3; ++column) {
+            size = std::max(size, std::fabs(a.linear[row][column]));
+        }
+        for (int column = 0; column < 3; ++column) {
+            if (std::fabs(a.linear[row][column] - b.linear[row][column]) > 1e-9 * size) {
+                return false;
+            }
+        }
+        const double offset = std::fabs(a.translation[row]);
+        if (std::fabs(a.translation[row] - b.translation[row]) > 1e-6 * size + 1e-12 * offset) {
+            return false;
+        }
+    }
+    return true;
+}
+
+// ---- Writing ------------------------------------------------------------------------------------
+
+/// OpenVDB's own writer wants all grids at once; this one makes them one by one.
+class SidecarArchive : public openvdb::io::Archive {
+  public:
+    SidecarArchive(std::ostream& stream, int32_t gridCount) : stream_(stream) {
+        openvdb::io::setDataCompression(stream_, compression());
+        openvdb::io::setWriteGridStatsMetadata(stream_, isGridStatsMetadataEnabled());
+        writeHeader(stream_, /*seekable=*/true);
+        openvdb::MetaMap fileMetadata;
+        fileMetadata.insertMeta("creator", openvdb::StringMetadata("vdbtrack " TRACK_VERSION));
+        fileMetadata.writeMeta(stream_);
+        stream_.write(reinterpret_cast<const char*>(&gridCount), sizeof(gridCount));
+    }
+    void add(const openvdb::GridBase::Ptr& grid) {
+        openvdb::io::GridDescriptor descriptor(grid->getName(), grid->type());
+        writeGrid(descriptor, grid, stream_, /*seekable=*/true);
+        openvdb::io::setDataCompression(stream_, compression());
+    }
+
+  private:
+    std::ostream& stream_;
+};
+
+void addMetadata(openvdb::GridBase& grid, const SidecarHeader& header) {
+    const auto text = [&](const char* name, const std::string& value) {
+        grid.insertMeta(name, openvdb::StringMetadata(value));
+    };
+    const auto number = [&](const char* name, int32_t value) {
+        grid.insertMeta(name, openvdb::Int32Metadata(value));
+    };
+    text("track_format", kFormat);
+    text("track_tool_version", header.toolVersion);
+    text("track_source_file", header.sourceFile);
+    text("track_source_grid", header.source.name);
+    number("track_source_index", header.source.index);
+    text("track_source_digest", hexDigest(header.digest));
+    number("track_super_voxel_size", header.superVoxelSize);
+    text("track_control", header.controlKind);
+    text("track_interpolation", kInterpolation);
+    number("track_levels", header.levels);
+    if (header.repair & TRK_REPAIR_DROP_NONFINITE) {
+        grid.insertMeta("track_dropped_nonfinite",
+                        openvdb::Int64Metadata(static_cast<int64_t>(header.dropped)));
+    }
+    if (header.repair & TRK_REPAIR_CLAMP_NEGATIVE) {
+        grid.insertMeta("track_clamped_negative",
+                        openvdb::Int64Metadata(static_cast<int64_t>(header.clamped)));
+    }
+}
+
+template <class GridType>
+openvdb::GridBase::Ptr makeGrid(const SparseTable& table, const Int3& anchor,
+                                const std::function<float(size_t)>& valueOf) {
+    using Value = typename GridType::ValueType;
+    auto grid = GridType::create();
+    auto accessor = grid->getAccessor();
+    const int itemShift = table.itemShift();
+    table.forEach([&](const Int3& lo, int shift, SparseTable::Entry entry) {
+        Int3 at;
+        for (size_t a = 0; a < 3; ++a) {
+            at[a] = (anchor[a] + lo[a]) >> itemShift;
+        }
+        const auto value = static_cast<Value>(valueOf(entry - 1));
+        if (shift == itemShift) {
+            accessor.setValueOn(toCoord(at), value);
+            return;
+        }
+        const int32_t size = 1 << (shift - itemShift);
+        grid->sparseFill(openvdb::CoordBBox::createCube(toCoord(at), size), value, true);
+    });
+    openvdb::tools::prune(grid->tree());
+    return grid;
+}
+
+openvdb::GridBase::Ptr makeGrid(const SidecarHeader& header, const SparseTable& table,
+                                const Int3& anchor, const std::string& suffix,
+                                const std::function<float(size_t)>& valueOf) {
+    openvdb::GridBase::Ptr grid = header.valueType == "double"
+                                      ? makeGrid<openvdb::DoubleGrid>(table, anchor, valueOf)
+                                      : makeGrid<openvdb::FloatGrid>(table, anchor, valueOf);
+    grid->setName(gridPrefix(header.source.name) + suffix);
+    grid->setGridClass(openvdb::GRID_FOG_VOLUME);
+    grid->setTransform(makeTransform(superVoxelMap(header.indexToWorld, 1 << table.itemShift())));
+    addMetadata(*grid, header);
+    return grid;
+}
+
+// ---- Reading ------------------------------------------------------------------------------------
+
+[[noreturn]] void badSidecar(const std::string& where, const std::string& what) {
+    throw Error(TRK_ERROR_BAD_FILE, where + ": " + what);
+}
+
+std::string metaText(const openvdb::GridBase& grid, const char* name, const std::string& where) {
+    const auto meta = grid.getMetadata<openvdb::StringMetadata>(name);
+    if (!meta) {
+        badSidecar(where, std::string("no metadata ") + name + "; not a sidecar of this tool");
+    }
+    return meta->value();
+}
+
+int metaNumber(const openvdb::GridBase& grid, const char* name, const std::string& where) {
+    const auto meta = grid.getMetadata<openvdb::Int32Metadata>(name);
+    if (!meta) {
+        badSidecar(where, std::string("no metadata ") + name + "; not a sidecar of this tool");
+    }
+    return meta->value();
+}
+
+void checkFormat(const openvdb::GridBase& grid, const std::string& where) {
+    const std::string format = metaText(grid, "track_format", where);
+    const int major = std::atoi(format.c_str());
+    if (major > kFormatMajor) {
+        throw Error(TRK_ERROR_SIDECAR_MISMATCH, where + ": sidecar format " + format +
+                                                    "; this build reads up to " + kFormat +
+                                                    "; bake again, or use a newer vdbtrack");
+    }
+    if (major < 1) {
+        badSidecar(where, "sidecar format is \"" + format + "\"; expected " + kFormat);
+    }
+}
+
+/// The grid whose name ends in _control; others are found from its prefix.
+const VdbEntry* findControl(const VdbFile& file) {
+    const std::string suffix = kStatistics[0].suffix;
+    for (const VdbEntry& entry : file.entries()) {
+        if (entry.name.size() > suffix.size() &&
+            entry.name.compare(entry.name.size() - suffix.size(), suffix.size(), suffix) == 0) {
+            return &entry;
+        }
+    }
+    return nullptr;
+}
+
+SidecarHeader readHeader(VdbFile& file) {
+    const VdbEntry* control = findControl(file);
+    if (!control) {
+        badSidecar(file.path(),
+                   "no grid …_control; expected a sidecar made by `vdbtrack bake`; the "
+                   "file has " +
+                       file.listing());
+    }
+    const std::string where = file.path() + ": grid " + control->name;
+    const openvdb::GridBase::Ptr grid = file.readMetadata(*control);
+    if (!grid) {
+        badSidecar(where, "has the unknown type " + control->type);
+    }
+    checkFormat(*grid, where);
+    SidecarHeader header;
+    header.toolVersion = metaText(*grid, "track_tool_version", where);
+    header.sourceFile = metaText(*grid, "track_source_file", where);
+    header.source.name = metaText(*grid, "track_source_grid", where);
+    header.source.index = metaNumber(*grid, "track_source_index", where);
+    header.digest =
+        std::strtoull(metaText(*grid, "track_source_digest", where).c_str(), nullptr, 16);
+    header.superVoxelSize = metaNumber(*grid, "track_super_voxel_size", where);
+    header.controlKind = metaText(*grid, "track_control", where);
+    header.levels = metaNumber(*grid, "track_levels", where);
+    header.valueType = grid->valueType();
+    const int size = header.superVoxelSize;
+    if (size < 4 || size > 64 || (size & (size - 1)) != 0) {
+        badSidecar(where, "super-voxel size " + std::to_string(size) +
+                              "; expected a power of two from 4 to 64");
+    }
+    if (header.levels < 0 || header.levels > 16) {
+        badSidecar(where, std::to_string(header.levels) + " levels; expected 0 to 16");
+    }
+    const std::string interpolation = metaText(*grid, "track_interpolation", where);
+    if (header.controlKind != "constant" || interpolation != kInterpolation) {
+        throw Error(TRK_ERROR_SIDECAR_MISMATCH,
+                    where + ": control \"" + header.controlKind + "\" of interpolation \"" +
+                        interpolation +
+                        "\"; this build reads constant controls of trilinear fields");
+    }
+    if (const auto meta = grid->getMetadata<openvdb::Int64Metadata>("track_dropped_nonfinite")) {
+        header.repair |= TRK_REPAIR_DROP_NONFINITE;
+        header.dropped = static_cast<uint64_t>(meta->value());
+    }
+    if (const auto meta = grid->getMetadata<openvdb::Int64Metadata>("track_clamped_negative")) {
+        header.repair |= TRK_REPAIR_CLAMP_NEGATIVE;
+        header.clamped = static_cast<uint64_t>(meta->value());
+    }
+    header.indexToWorld = sourceMap(affineMap(grid->constTransform(), where), size);
+    return header;
+}
+
+std::string label(const GridIdentity& grid) {
+    return "\"" + grid.name + "\"[" + std::to_string(grid.index) + "]";
+}
+
+void checkAgainst(const SidecarHeader& header, const DensitySummary& density, TrkCheck check,
+                  const std::string& path) {
+    const auto mismatch = [&](const std::string& sidecarHas, const std::string& densityHas) {
+        throw Error(TRK_ERROR_SIDECAR_MISMATCH, path + ": " + sidecarHas + ", but " + density.path +
+                                                    " " + densityHas +
+                                                    "; bake it again, or name the right sidecar");
+    };
+    if (header.source.name != density.grid.name || header.source.index != density.grid.index) {
+        mismatch("baked from grid " + label(header.source),
+                 "was opened at grid " + label(density.grid));
+    }
+    if (header.valueType != density.valueType) {
+        mismatch("baked from a " + header.valueType + " grid",
+                 "holds a " + density.valueType + " grid");
+    }
+    if (!sameMap(density.indexToWorld, header.indexToWorld)) {
+        const auto describe = [](const AffineMap& map) {
+            char text[160];
+            std::snprintf(text, sizeof(text), "voxels of %g x %g x %g at (%g, %g, %g)",
+                          length(map.column(0)), length(map.column(1)), length(map.column(2)),
+                          map.translation[0], map.translation[1], map.translation[2]);
+            return std::string(text);
+        };
+        mismatch("baked with another transform (" + describe(header.indexToWorld) + ")",
+                 "has " + describe(density.indexToWorld));
+    }
+    if (check == TRK_CHECK_FULL && header.digest != density.digest) {
+        mismatch("baked from other voxels (digest " + hexDigest(header.digest) + ")",
+                 "has digest " + hexDigest(density.digest));
+    }
+}
+
+const VdbEntry& findGrid(const VdbFile& file, const std::string& name) {
+    for (const VdbEntry& entry : file.entries()) {
+        if (entry.name == name) {
+            return entry;
+        }
+    }
+    badSidecar(file.path(), "grid " + name + " is missing; the file has " + file.listing());
+}
+
+template <class TreeType>
+class SidecarReader {
+  public:
+    using GridType = openvdb::Grid<TreeType>;
+    using Regions = TreeRegions<TreeType>;
+
+    SidecarReader(VdbFile& file, const SidecarHeader& header, TrkCheck check)
+        : file_(file), header_(header), check_(check) {}
+
+    void read(const Int3* anchor, Sidecar& sidecar) {
+        const std::string prefix = gridPrefix(header_.source.name);
+        int shift = 0;
+        while (1 << shift < header_.superVoxelSize) {
+            ++shift;
+        }
+        BakedVolume& baked = sidecar.baked;
+        baked.superVoxelShift = shift;
+
+        // Where the RMS is 0 all over a region, the field is one constant there, so the region is
+        // one item; this grid therefore decides which regions are told apart.
+        std::vector<Int3> corners;
+        uint64_t activeVoxels = 0;
+        {
+            const auto grid = readGrid(prefix + "_rms", shift);
+            activeVoxels = grid->activeVoxelCount();
+            sidecar.anchor = anchor ? *anchor : anchorFor(supportBox(grid->tree(), shift));
+            baked.table = makeTable(grid->tree(), shift, sidecar.anchor, /*onlyZero=*/true,
+                                    [&](const Int3& at, int size, float value) {
+                                        BakedSuperVoxel item;
+                                        item.rms = value;
+                                        baked.items.push_back(item);
+                                        corners.push_back(at);
+                                        tileShifts_.push_back(size);
+                                        return baked.items.size();
+                                    });
+        }
+        for (const Statistic& statistic : kStatistics) {
+            if (statistic.value == &BakedSuperVoxel::rms) {
+                continue;
+            }
+            const auto grid = readGrid(prefix + statistic.suffix, shift);
+            if (grid->activeVoxelCount() != activeVoxels) {
+                badSidecar(file_.path(), "grid " + grid->getName() + " has " +
+                                             std::to_string(grid->activeVoxelCount()) +
+                                             " active super-voxels, " + prefix + "_rms " +
+                                             std::to_string(activeVoxels));
+            }
+            Regions regions(grid->tree());
+            for (size_t i = 0; i < corners.size(); ++i) {
+                const auto region = regions.uniform(corners[i], tileShifts_[i]);
+                if (!region || !region->active) {
+                    badSidecar(file_.path(), "grids " + grid->getName() + " and " + prefix +
+                                                 "_rms disagree at " + where(corners[i]));
+                }
+                baked.items[i].*statistic.value = static_cast<float>(region->value);
+            }
+        }
+        if (check_ == TRK_CHECK_FULL) {
+            for (size_t i = 0; i < corners.size(); ++i) {
+                checkItem(baked.items[i], corners[i]);
+            }
+        }
+        for (int level = 1; level <= header_.levels; ++level) {
+            const auto grid = readGrid(prefix + levelSuffix(level), shift + level);
+            PreviewLevel preview;
+            preview.table = makeTable(
+                grid->tree(), shift + level, sidecar.anchor,
+                /*onlyZero=*/false, [&](const Int3& at, int, float value) {
+                    if (!(value >= 0) || !std::isfinite(value)) {
+                        badSidecar(file_.path(), "grid " + grid->getName() + " holds " +
+                                                     std::to_string(value) + " at " + where(at));
+                    }
+                    preview.mean.push_back(value);
+                    return preview.mean.size();
+                });
+            baked.levels.push_back(std::move(preview));
+        }
+    }
+
+  private:
+    static std::string where(const Int3& at) {
+        return "super-voxel (" + std::to_string(at[0]) + ", " + std::to_string(at[1]) + ", " +
+               std::to_string(at[2]) + ")";
+    }
+
+    typename GridType::Ptr readGrid(const std::string& name, int shift) {
+        const VdbEntry& entry = findGrid(file_, name);
+        const std::string place = file_.path() + ": grid " + name;
+        if (entry.type != TreeType::treeType()) {
+            badSidecar(place, "is of type " + entry.type + "; expected " + TreeType::treeType());
+        }
+        auto grid = openvdb::gridPtrCast<GridType>(file_.read(entry));
+        checkFormat(*grid, place);
+        if (metaText(*grid, "track_source_digest", place) != hexDigest(header_.digest)) {
+            badSidecar(place, "comes from another bake than the file's other grids");
+        }
+        const AffineMap expected = superVoxelMap(header_.indexToWorld, 1 << shift);
+        if (!sameMap(expected, affineMap(grid->constTransform(), place))) {
+            badSidecar(place, "does not lie over the file's control grid: its transform differs");
+        }
+        if (!(grid->background() == 0)) {
+            badSidecar(place, "background is not 0");
+        }
+        return grid;
+    }
+
+    static IntBox supportBox(const TreeType& tree, int shift) {
+        IntBox box;
+        openvdb::CoordBBox active;
+        if (tree.evalActiveVoxelBoundingBox(active)) {
+            const int64_t size = int64_t{1} << shift;
+            Int3 lo = toInt3(active.min());
+            Int3 hi = toInt3(active.max());
+            for (size_t a = 0; a < 3; ++a) {
+                lo[a] *= size;
+                hi[a] = (hi[a] + 1) * size;
+            }
+            box.add(lo, hi);
+        }
+        return box;
+    }
+
+    /// Builds a table with one item per active value, or per region of one value (with `onlyZero`,
+    /// of value 0). `add(super-voxel index, log2 of the region's edge, value)` answers the item's
+    /// number, from 1.
+    template <class Add>
+    static SparseTable makeTable(const TreeType& tree, int shift, const Int3& anchor, bool onlyZero,
+                                 const Add& add) {
+        IntBox box = supportBox(tree, shift);
+        if (box.empty()) {
+            return {};
+        }
+        for (size_t a = 0; a < 3; ++a) {
+            box.lo[a] -= anchor[a];
+            box.hi[a] -= anchor[a];
+        }
+        SparseTable table(shift, box);
+        Regions regions(tree);
+        const auto index = [&](const Int3& local) {
+            return Int3{{(anchor[0] + local[0]) >> shift, (anchor[1] + local[1]) >> shift,
+                         (anchor[2] + local[2]) >> shift}};
+        };
+        table.fill(
+            [&](const Int3& local, int regionShift) -> std::optional<SparseTable::Entry> {
+                const Int3 at = index(local);
+                const auto region = regions.uniform(at, regionShift - shift);
+                if (!region) {
+                    return std::nullopt;
+                }
+                if (!region->active) {
+                    return SparseTable::kEmpty;
+                }
+                if (regionShift > shift && onlyZero && !(region->value == 0)) {
+                    return std::nullopt;
+                }
+                return static_cast<SparseTable::Entry>(
+                    add(at, regionShift - shift, static_cast<float>(region->value)));
+            },
+            [&](const Int3&) { return SparseTable::kEmpty; });
+        return table;
+    }
+
+    void checkItem(const BakedSuperVoxel& v, const Int3& at) const {
+        const double slack = 1 + 1e-6;
+        const double control = static_cast<double>(v.control);
+        const double needed =
+            std::max(control - static_cast<double>(v.min), static_cast<double>(v.max) - control);
+        const char* wrong = nullptr;
+        for (const Statistic& statistic : kStatistics) {
+            if (!(v.*statistic.value >= 0) || !std::isfinite(v.*statistic.value)) {
+                wrong = "a value that is negative, NaN or infinite";
+            }
+        }
+        if (wrong) {
+        } else if (v.rms > 0 && v.majorant == 0) {
+            wrong = "majorant 0 with an RMS above 0";
+        } else if (v.min > v.max || v.control * slack < static_cast<double>(v.min) ||
+                   control > static_cast<double>(v.max) * slack) {
+            wrong = "a control that is not between min and max";
+        } else if (static_cast<double>(v.majorant) * slack < needed) {
+            wrong = "a majorant that does not bound the residual";
+        } else if (static_cast<double>(v.rms) > static_cast<double>(v.majorant) * slack) {
+            wrong = "an RMS above its majorant";
+        }
+        if (wrong) {
+            char text[160];
+            std::snprintf(text, sizeof(text), " (control %g, majorant %g, rms %g, min %g, max %g)",
+                          control, static_cast<double>(v.majorant), static_cast<double>(v.rms),
+                          static_cast<double>(v.min), static_cast<double>(v.max));
+            badSidecar(file_.path(), where(at) + " has " + wrong + text);
+        }
+    }
+
+    VdbFile& file_;
+    const SidecarHeader& header_;
+    TrkCheck check_;
+    std::vector<int> tileShifts_;
+};
+
+}  // namespace
+
+bool isSidecar(const std::string& path) {
+    VdbFile file(path);
+    const VdbEntry* control = findControl(file);
+    const openvdb::GridBase::Ptr grid = control ? file.readMetadata(*control) : nullptr;
+    return grid && grid->getMetadata<openvdb::StringMetadata>("track_format");
+}
+
+SidecarHeader readSidecarHeader(const std::string& path) {
+    VdbFile file(path);
+    return readHeader(file);
+}
+
+Sidecar readSidecar(const std::string& path, const DensitySummary* density, TrkCheck check) {
+    VdbFile file(path);
+    Sidecar sidecar;
+    sidecar.header = readHeader(file);
+    if (density) {
+        checkAgainst(sidecar.header, *density, check, path);
+    }
+    const Int3* anchor = density ? &density->anchor : nullptr;
+    if (sidecar.header.valueType == "double") {
+        SidecarReader<openvdb::DoubleTree>(file, sidecar.header, check).read(anchor, sidecar);
+    } else {
+        SidecarReader<openvdb::FloatTree>(file, sidecar.header, check).read(anchor, sidecar);
+    }
+    return sidecar;
+}
+
+void writeSidecar(const OutputFile& file, const SidecarHeader& header, const BakedVolume& baked,
+                  const Int3& anchor) {
+    openvdb::initialize();
+    try {
+        std::ofstream stream;
+        stream.exceptions(std::ios::badbit | std::ios::failbit);
+        stream.open(file.path(), std::ios::binary);
+        const auto levels = static_cast<int32_t>(baked.levels.size());
+        SidecarArchive archive(stream, static_cast<int32_t>(std::size(kStatistics)) + levels);
+        for (const Statistic& statistic : kStatistics) {
+            archive.add(makeGrid(header, baked.table, anchor, statistic.suffix,
+                                 [&](size_t i) { return baked.items[i].*statistic.value; }));
+        }
+        for (int32_t level = 1; level <= levels; ++level) {
+            const PreviewLevel& preview = baked.levels[static_cast<size_t>(level) - 1];
+            archive.add(makeGrid(header, preview.table, anchor, levelSuffix(level),
+                                 [&](size_t i) { return preview.mean[i]; }));
+        }
+        stream.close();
+    } catch (const std::ios_base::failure&) {
+        throw Error(TRK_ERROR_IO, file.target() + ": cannot be written (disk full?)");
+    } catch (const openvdb::Exception& e) {
+        throw Error(TRK_ERROR_IO, file.target() + ": cannot be written: " + e.what());
+    }
+}
+
+}  // namespace trk

@@ -1,0 +1,132 @@
+// SPDX-License-Identifier: Apache-2.0
+// Questions about whole regions of an OpenVDB tree, answered from its nodes, in 64-bit coordinates.
+#pragma once
+
+#include "../math.h"
+
+#include <openvdb/openvdb.h>
+#include <openvdb/tree/ValueAccessor.h>
+
+#include <algorithm>
+#include <cstdint>
+#include <limits>
+#include <optional>
+#include <type_traits>
+#include <vector>
+
+namespace trk {
+
+/// Caches its way through the tree: one for each thread.
+template <class TreeType>
+class TreeRegions {
+  public:
+    using Leaf = typename TreeType::LeafNodeType;
+    using Value = typename TreeType::ValueType;
+
+    struct Region {
+        Value value;
+        bool active;
+    };
+
+    explicit TreeRegions(const TreeType& tree) : tree_(tree), accessor_(tree) {
+        for (auto it = tree.root().cbeginChildAll(); it; ++it) {
+            Value value = tree.background();
+            if (it.probeChild(value) || !(value == tree.background()) || it.isValueOn()) {
+                const openvdb::Coord o = it.getCoord();
+                rootOrigins_.push_back({{o.x(), o.y(), o.z()}});
+            }
+        }
+    }
+
+    /// NULL where a tile or nothing is.
+    const Leaf* leaf(const Int3& at) {
+        return inRange(at) ? accessor_.probeConstLeaf(coord(at)) : nullptr;
+    }
+    Value value(const Int3& at) {
+        return inRange(at) ? accessor_.getValue(coord(at)) : tree_.background();
+    }
+
+    /// Value and state of the aligned region of 2^shift voxels at `origin`, if no node divides it
+    /// into different ones. A leaf counts as divided.
+    std::optional<Region> uniform(const Int3& origin, int shift) {
+        const Region nothing{tree_.background(), false};
+        if (!inRange(origin)) {
+            return nothing;
+        }
+        if (shift > kUpperShift) {  // may hold several of the root's regions: uniform only if empty
+            const int64_t size = int64_t{1} << shift;
+            for (const Int3& o : rootOrigins_) {
+                if (o[0] >= origin[0] && o[0] < origin[0] + size && o[1] >= origin[1] &&
+                    o[1] < origin[1] + size && o[2] >= origin[2] && o[2] < origin[2] + size) {
+                    return std::nullopt;
+                }
+            }
+            return nothing;
+        }
+        const openvdb::Coord at = coord(origin);
+        const auto* upper = accessor_.template probeConstNode<Upper>(at);
+        if (upper) {
+            if (shift == kUpperShift) {
+                return std::nullopt;
+            }
+            if (shift >= kLowerShift) {
+                return uniformTiles(*upper, at, shift, kLowerShift);
+            }
+            if (const auto* lower = accessor_.template probeConstNode<Lower>(at)) {
+                if (shift >= kLeafShift) {
+                    return uniformTiles(*lower, at, shift, kLeafShift);
+                }
+            }
+        }
+        Region region{};
+        region.active = accessor_.probeValue(at, region.value);
+        return region;
+    }
+
+  private:
+    using Upper = typename TreeType::RootNodeType::ChildNodeType;  // 4096^3 voxels
+    using Lower = typename Upper::ChildNodeType;                   // 128^3 voxels
+    static constexpr int kUpperShift = 12;
+    static constexpr int kLowerShift = 7;
+    static constexpr int kLeafShift = 3;
+
+    static bool inRange(const Int3& p) {
+        return std::all_of(p.begin(), p.end(), [](int64_t x) {
+            return x >= std::numeric_limits<int32_t>::min() &&
+                   x <= std::numeric_limits<int32_t>::max();
+        });
+    }
+    static openvdb::Coord coord(const Int3& p) {
+        return {static_cast<int32_t>(p[0]), static_cast<int32_t>(p[1]), static_cast<int32_t>(p[2])};
+    }
+
+    template <class NodeType>
+    static std::optional<Region> uniformTiles(const NodeType& node, const openvdb::Coord& at,
+                                              int shift, int childShift) {
+        const auto tile = [&](openvdb::Index n) -> std::optional<Region> {
+            if (node.isChildMaskOn(n)) {
+                return std::nullopt;
+            }
+            return Region{node.getTable()[n].getValue(), node.isValueMaskOn(n)};
+        };
+        const auto expected = tile(NodeType::coordToOffset(at));
+        const int32_t count = 1 << (shift - childShift);
+        for (int32_t i = 0; expected && i < count * count * count; ++i) {
+            const int32_t x = i / (count * count);
+            const int32_t y = i / count % count;
+            const int32_t z = i % count;
+            const auto found = tile(NodeType::coordToOffset(
+                at.offsetBy(x << childShift, y << childShift, z << childShift)));
+            if (!found || !(found->value == expected->value) || found->active != expected->active) {
+                return std::nullopt;
+            }
+        }
+        return expected;
+    }
+
+    const TreeType& tree_;
+    openvdb::tree::ValueAccessor<const TreeType, /*IsSafe=*/false> accessor_;
+    std::vector<Int3> rootOrigins_;
+};
+
+}  // namespace trk

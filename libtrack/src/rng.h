@@ -1,0 +1,39 @@
+// SPDX-License-Identifier: Apache-2.0
+// Random numbers that depend on nothing but who asks: (seed, stream, ray id, sample).
+#pragma once
+
+#include <cmath>
+#include <cstdint>
+
+namespace trk {
+
+/// SplitMix64 [Steele, Lea, Flood 2014] started at a hash of its owner: one addition and one mixing
+/// a number, no state shared between rays, threads or calls.
+class Rng {
+  public:
+    Rng(uint64_t seed, uint64_t stream, uint64_t rayId, uint64_t sample)
+        : state_(mix(mix(mix(mix(seed) + stream) + rayId) + sample)) {}
+
+    uint64_t next() {
+        state_ += 0x9e3779b97f4a7c15u;
+        return mix(state_);
+    }
+
+    /// Exponentially distributed with mean 1; never 0 / 0 and at most 23.
+    double exponential() {
+        const auto u = (static_cast<float>(next() >> 32) + 0.5f) * 0x1p-32f;  // (0, 1]
+        return static_cast<double>(-std::log(u));
+    }
+
+  private:
+    static uint64_t mix(uint64_t z) {
+        z += 0x9e3779b97f4a7c15u;
+        z = (z ^ (z >> 30)) * 0xbf58476d1ce4e5b9u;
+        z = (z ^ (z >> 27)) * 0x94d049bb133111ebu;
+        return z ^ (z >> 31);
+    }
+
+    uint64_t state_;
+};
+
+}  // namespace trk

@@ -1,0 +1,305 @@
+// SPDX-License-Identifier: Apache-2.0
+// A sparse table over integer space and the walk of a ray through it. Both the extinction field
+// (whose items are bricks of 8^3 voxels) and the super-voxels (items of N^3 voxels) live in one.
+#pragma once
+
+#include "math.h"
+
+#include <array>
+#include <cstdint>
+#include <optional>
+#include <unordered_map>
+#include <vector>
+
+namespace trk {
+
+/// A ray in local space (voxels, relative to the volume's anchor), clipped and re-origined: it
+/// starts at t = 0 inside the volume's box. `direction` has unit length, so t counts voxels.
+struct LocalRay {
+    Vec3d origin;
+    Vec3d direction;
+    Vec3d inverse;  ///< 1 / direction; huge where that is 0, so that its planes are never next
+    double tEnd = 0;
+
+    Vec3d at(double t) const { return origin + t * direction; }
+};
+
+/// Maps integer points to 32-bit entries: a dense root box over nodes of 8^3 children, as deep as
+/// the extent asks for. An entry above item level is a tile: it stands for its whole region. What
+/// an entry means beyond "empty" is its owner's; equal entries must mean equal contents. Nodes may
+/// be shared between places that look alike (large tiles have large, but very regular, surfaces).
+/// Memory goes with what is occupied; a step of the walk crosses the largest region found empty.
+class SparseTable {
+  public:
+    using Entry = uint32_t;
+    using Node = std::array<Entry, 512>;
+
+    static constexpr Entry kEmpty = 0;
+    static constexpr Entry kNodeFlag = 0x80000000u;
+
+    struct Found {
+        Entry entry;
+        int shift;  ///< log2 of the edge, in voxels, of the region the entry stands for
+    };
+
+    SparseTable() = default;
+
+    /// An empty table of items of 2^itemShift voxels over `box` (voxels, local, not negative).
+    SparseTable(int itemShift, const IntBox& box) : itemShift_(itemShift) {
+        if (box.empty()) {
+            return;
+        }
+        // A root of up to 32^3 regions stays in cache; deeper tables only for larger extents.
+        constexpr int64_t kMaxRootRegions = 1 << 15;
+        for (rootShift_ = itemShift + 3;; rootShift_ += 3) {
+            for (size_t a = 0; a < 3; ++a) {
+                rootLo_[a] = box.lo[a] >> rootShift_;
+                rootSize_[a] = ((box.hi[a] - 1) >> rootShift_) + 1 - rootLo_[a];
+            }
+            const double regions = static_cast<double>(rootSize_[0]) *
+                                   static_cast<double>(rootSize_[1]) *
+                                   static_cast<double>(rootSize_[2]);
+            if (regions <= kMaxRootRegions) {
+                break;
+            }
+        }
+        root_.assign(static_cast<size_t>(rootSize_[0] * rootSize_[1] * rootSize_[2]), kEmpty);
+    }
+
+    int itemShift() const { return itemShift_; }
+    bool empty() const { return root_.empty(); }
+    size_t bytes() const {
+        return root_.capacity() * sizeof(Entry) + nodes_.capacity() * sizeof(Node);
+    }
+
+    /// Fills the table top down. `uniform(origin, shift)` answers for the region of 2^shift voxels:
+    /// an entry that stands for all of it, or nothing, whereupon its eight times eight times eight
+    /// parts are asked; `item(origin)` answers where items are not uniform.
+    template <class Uniform, class Item>
+    void fill(Uniform&& uniform, Item&& item) {
+        forEachRootRegion([&](size_t i, const Int3& origin) {
+            root_[i] = build(origin, rootShift_, uniform, item);
+        });
+    }
+
+    /// Adds a node, or only answers its entry where all children are the same tile.
+    Entry addNode(const Node& node) {
+        const bool same =
+            std::all_of(node.begin(), node.end(), [&](Entry e) { return e == node[0]; });
+        if (same && (node[0] & kNodeFlag) == 0) {
+            return node[0];
+        }
+        nodes_.push_back(node);
+        return static_cast<Entry>(nodes_.size() - 1) | kNodeFlag;
+    }
+
+    /// The same table with every item and tile entry replaced by `map(entry)`, nodes that became
+    /// uniform collapsed, and the nodes of one region next to each other in memory.
+    template <class Map>
+    SparseTable mapped(Map&& map) const {
+        SparseTable result = *this;
+        result.nodes_.clear();
+        std::unordered_map<Entry, Entry> done;
+        for (Entry& e : result.root_) {
+            e = mapEntry(e, map, done, result);
+        }
+        result.nodes_.shrink_to_fit();
+        return result;
+    }
+
+    Found find(int64_t x, int64_t y, int64_t z) const {
+        const uint64_t rx = static_cast<uint64_t>((x >> rootShift_) - rootLo_[0]);
+        const uint64_t ry = static_cast<uint64_t>((y >> rootShift_) - rootLo_[1]);
+        const uint64_t rz = static_cast<uint64_t>((z >> rootShift_) - rootLo_[2]);
+        const uint64_t ny = static_cast<uint64_t>(rootSize_[1]);
+        const uint64_t nz = static_cast<uint64_t>(rootSize_[2]);
+        if (rx >= static_cast<uint64_t>(rootSize_[0]) || ry >= ny || rz >= nz) {
+            return {kEmpty, rootShift_};
+        }
+        Entry entry = root_[(rx * ny + ry) * nz + rz];
+        int shift = rootShift_;
+        while (entry & kNodeFlag) {
+            shift -= 3;
+            entry = nodes_[entry & ~kNodeFlag][childIndex(x >> shift, y >> shift, z >> shift)];
+        }
+        return {entry, shift};
+    }
+
+    /// Calls `visit(entry, lo, shift, tEnter, tExit)` for every occupied region the ray meets in
+    /// [t0, t1], in order, until it answers false. Regions abut: one's tExit is the next one's
+    /// tEnter, both computed from the integer plane between them, and the last tExit is t1.
+    template <class Visit>
+    void walk(const LocalRay& ray, double t0, double t1, Visit&& visit) const {
+        if (root_.empty()) {
+            return;
+        }
+        Int3 boxLo, boxHi, cell;
+        const Vec3d start = ray.at(t0);
+        for (size_t a = 0; a < 3; ++a) {
+            const int axis = static_cast<int>(a);
+            boxLo[a] = rootLo_[a] << rootShift_;
+            boxHi[a] = (rootLo_[a] + rootSize_[a]) << rootShift_;
+            cell[a] = clampCell(start[axis], boxLo[a], boxHi[a]);
+        }
+        for (double t = t0;;) {
+            const auto [entry, shift] = find(cell[0], cell[1], cell[2]);
+            const int64_t size = int64_t{1} << shift;
+            Int3 lo;
+            double tExit = t1;
+            size_t exitAxis = 3;
+            for (size_t a = 0; a < 3; ++a) {
+                const int axis = static_cast<int>(a);
+                lo[a] = (cell[a] >> shift) << shift;
+                const int64_t plane = ray.direction[axis] < 0 ? lo[a] : lo[a] + size;
+                const double tPlane =
+                    (static_cast<double>(plane) - ray.origin[axis]) * ray.inverse[axis];
+                if (tPlane < tExit) {
+                    tExit = tPlane;
+                    exitAxis = a;
+                }
+            }
+            tExit = std::max(tExit, t);
+            if (entry != kEmpty && tExit > t && !visit(entry, lo, shift, t, tExit)) {
+                return;
+            }
+            if (exitAxis == 3) {
+                return;
+            }
+            for (size_t a = 0; a < 3; ++a) {
+                const int axis = static_cast<int>(a);
+                if (a == exitAxis) {
+                    cell[a] = ray.direction[axis] < 0 ? lo[a] - 1 : lo[a] + size;
+                    if (cell[a] < boxLo[a] || cell[a] >= boxHi[a]) {
+                        return;
+                    }
+                } else {
+                    cell[a] = clampCell(ray.origin[axis] + tExit * ray.direction[axis], lo[a],
+                                        lo[a] + size);
+                }
+            }
+            t = tExit;
+        }
+    }
+
+    /// Calls `f(lo, shift, entry)` for every occupied item and tile.
+    template <class F>
+    void forEach(F&& f) const {
+        forEachRootRegion(
+            [&](size_t i, const Int3& origin) { visitEntry(root_[i], origin, rootShift_, f); });
+    }
+
+    /// Box around everything occupied.
+    IntBox occupiedBox() const {
+        IntBox box;
+        forEach([&](const Int3& lo, int shift, Entry) {
+            const int64_t size = int64_t{1} << shift;
+            box.add(lo, {{lo[0] + size, lo[1] + size, lo[2] + size}});
+        });
+        return box;
+    }
+
+    /// The one entry that stands for everywhere in the region of 2^shift voxels at `origin`, if
+    /// any. Items that fill the region count too.
+    std::optional<Entry> uniformEntry(const Int3& origin, int shift) const {
+        const Found found = find(origin[0], origin[1], origin[2]);
+        if (found.shift >= shift) {
+            return found.entry;
+        }
+        const int64_t half = int64_t{1} << (shift - 1);
+        for (int64_t octant = 0; octant < 8; ++octant) {
+            const Int3 part{{origin[0] + (octant >> 2) * half, origin[1] + (octant >> 1 & 1) * half,
+                             origin[2] + (octant & 1) * half}};
+            const auto entry = uniformEntry(part, shift - 1);
+            if (!entry || *entry != found.entry) {
+                return std::nullopt;
+            }
+        }
+        return found.entry;
+    }
+
+    static size_t childIndex(int64_t x, int64_t y, int64_t z) {
+        return static_cast<size_t>((x & 7) << 6 | (y & 7) << 3 | (z & 7));
+    }
+    static Int3 childOrigin(const Int3& origin, int childShift, size_t child) {
+        const auto c = static_cast<int64_t>(child);
+        return {{origin[0] + ((c >> 6) << childShift), origin[1] + ((c >> 3 & 7) << childShift),
+                 origin[2] + ((c & 7) << childShift)}};
+    }
+
+  private:
+    static int64_t clampCell(double x, int64_t lo, int64_t hi) {
+        // Points here are never negative but for rounding, so truncation is as good as floor.
+        return std::min(std::max(static_cast<int64_t>(x), lo), hi - 1);
+    }
+
+    template <class F>
+    void forEachRootRegion(F&& f) const {
+        size_t i = 0;
+        for (int64_t x = 0; x < rootSize_[0]; ++x) {
+            for (int64_t y = 0; y < rootSize_[1]; ++y) {
+                for (int64_t z = 0; z < rootSize_[2]; ++z, ++i) {
+                    f(i, Int3{{(rootLo_[0] + x) << rootShift_, (rootLo_[1] + y) << rootShift_,
+                               (rootLo_[2] + z) << rootShift_}});
+                }
+            }
+        }
+    }
+
+    template <class Uniform, class Item>
+    Entry build(const Int3& origin, int shift, Uniform& uniform, Item& item) {
+        if (const std::optional<Entry> entry = uniform(origin, shift)) {
+            return *entry;
+        }
+        if (shift == itemShift_) {
+            return item(origin);
+        }
+        Node node;
+        for (size_t c = 0; c < node.size(); ++c) {
+            node[c] = build(childOrigin(origin, shift - 3, c), shift - 3, uniform, item);
+        }
+        return addNode(node);
+    }
+
+    template <class Map>
+    Entry mapEntry(Entry entry, Map& map, std::unordered_map<Entry, Entry>& done,
+                   SparseTable& result) const {
+        if (entry == kEmpty) {
+            return kEmpty;
+        }
+        if ((entry & kNodeFlag) == 0) {
+            return map(entry);
+        }
+        if (const auto it = done.find(entry); it != done.end()) {
+            return it->second;
+        }
+        Node node = nodes_[entry & ~kNodeFlag];
+        for (Entry& child : node) {
+            child = mapEntry(child, map, done, result);
+        }
+        return done[entry] = result.addNode(node);
+    }
+
+    template <class F>
+    void visitEntry(Entry entry, const Int3& origin, int shift, F& f) const {
+        if (entry == kEmpty) {
+            return;
+        }
+        if ((entry & kNodeFlag) == 0) {
+            f(origin, shift, entry);
+            return;
+        }
+        for (size_t c = 0; c < 512; ++c) {
+            visitEntry(nodes_[entry & ~kNodeFlag][c], childOrigin(origin, shift - 3, c), shift - 3,
+                       f);
+        }
+    }
+
+    int itemShift_ = 0;
+    int rootShift_ = 0;
+    Int3 rootLo_{{0, 0, 0}};
+    Int3 rootSize_{{0, 0, 0}};
+    std::vector<Entry> root_;
+    std::vector<Node> nodes_;
+};
+
+}  // namespace trk

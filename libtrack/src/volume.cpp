@@ -1,0 +1,160 @@
+// SPDX-License-Identifier: Apache-2.0
+#include "volume.h"
+
+#include "error.h"
+#include "io/density.h"
+#include "io/sidecar.h"
+
+#include <cmath>
+#include <filesystem>
+#include <limits>
+#include <sstream>
+#include <utility>
+
+namespace trk {
+namespace {
+
+/// scale x density must stay within float, or every bound made of it is infinite.
+void checkScale(float scale, float maxDensity, const std::string& where) {
+    if (static_cast<double>(scale) * static_cast<double>(maxDensity) >
+        static_cast<double>(std::numeric_limits<float>::max())) {
+        std::ostringstream line;
+        line << where << ": scale " << scale << " x density " << maxDensity
+             << " is more than a float holds; expected at most "
+             << std::numeric_limits<float>::max();
+        throw Error(TRK_ERROR_INVALID_ARGUMENT, line.str());
+    }
+}
+
+void checkMemory(uint64_t wanted, uint64_t cap, const std::string& path) {
+    if (cap > 0 && wanted > cap) {
+        throw Error(TRK_ERROR_OUT_OF_MEMORY,
+                    path + ": needs " + std::to_string(wanted) +
+                        " bytes, more than maxMemory = " + std::to_string(cap));
+    }
+}
+
+float maxDensity(const BakedVolume& baked) {
+    float max = 0;
+    for (const BakedSuperVoxel& item : baked.items) {
+        max = std::max(max, item.max);
+    }
+    return max;
+}
+
+}  // namespace
+
+bool Volume::clip(const TrkRay& ray, const IntBox& box, LocalRay& local,
+                  double& lengthPerVoxel) const {
+    if (box.empty() || !(ray.tMin < ray.tMax)) {
+        return false;
+    }
+    const Vec3d worldOrigin{{static_cast<double>(ray.origin[0]), static_cast<double>(ray.origin[1]),
+                             static_cast<double>(ray.origin[2])}};
+    const Vec3d worldDirection{{static_cast<double>(ray.direction[0]),
+                                static_cast<double>(ray.direction[1]),
+                                static_cast<double>(ray.direction[2])}};
+    const Vec3d indexDirection = worldToIndex.vector(worldDirection);
+    const double voxelsPerT = length(indexDirection);
+    Vec3d origin = worldToIndex.point(worldOrigin);
+    double t0 = static_cast<double>(ray.tMin) * voxelsPerT;
+    double t1 = static_cast<double>(ray.tMax) * voxelsPerT;
+    for (int a = 0; a < 3; ++a) {
+        const auto axis = static_cast<size_t>(a);
+        origin[a] -= static_cast<double>(anchor[axis]);
+        const double d = indexDirection[a] / voxelsPerT;
+        local.direction[a] = d;
+        const auto lo = static_cast<double>(box.lo[axis]);
+        const auto hi = static_cast<double>(box.hi[axis]);
+        // A component that cannot cross a voxel within any box counts as 0.
+        if (std::fabs(d) < 1e-30) {
+            local.direction[a] = 0;
+            local.inverse[a] = 1e300;
+            if (!(origin[a] >= lo && origin[a] <= hi)) {
+                return false;
+            }
+            continue;
+        }
+        local.inverse[a] = 1 / d;
+        const double ta = (lo - origin[a]) / d;
+        const double tb = (hi - origin[a]) / d;
+        t0 = std::max(t0, std::min(ta, tb));
+        t1 = std::min(t1, std::max(ta, tb));
+    }
+    if (!(t0 < t1)) {
+        return false;
+    }
+    for (int a = 0; a < 3; ++a) {
+        const auto axis = static_cast<size_t>(a);
+        local.origin[a] = std::min(
+            std::max(origin[a] + t0 * local.direction[a], static_cast<double>(box.lo[axis])),
+            static_cast<double>(box.hi[axis]));
+    }
+    local.tEnd = t1 - t0;
+    lengthPerVoxel = length(worldDirection) / voxelsPerT;
+    return true;
+}
+
+std::string defaultSidecarPath(const std::string& vdbPath) {
+    std::filesystem::path path(vdbPath);
+    if (path.extension() == ".vdb") {
+        path.replace_extension();
+    }
+    return path.string() + ".track.vdb";
+}
+
+Volume openVolume(const char* vdbPath, const char* sidecarPath, const VolumeOptions& options) {
+    Volume volume;
+    volume.scale = options.scale;
+    const bool named = sidecarPath != nullptr && *sidecarPath != '\0';
+    const bool wanted = sidecarPath == nullptr || named;
+    if (named) {
+        volume.sidecarPath = sidecarPath;
+    } else if (wanted && vdbPath != nullptr) {
+        volume.sidecarPath = defaultSidecarPath(vdbPath);
+    }
+    if (vdbPath == nullptr && !named) {
+        throw Error(TRK_ERROR_INVALID_ARGUMENT,
+                    "neither a density nor a sidecar was named; expected at least one path");
+    }
+    const bool haveSidecar = named || (wanted && std::filesystem::exists(volume.sidecarPath));
+
+    Sidecar sidecar;
+    if (haveSidecar) {
+        sidecar.header = readSidecarHeader(volume.sidecarPath);
+    }
+    if (vdbPath == nullptr) {
+        sidecar = readSidecar(volume.sidecarPath, nullptr, options.check);
+        volume.grid = sidecar.header.source;
+        volume.indexToWorld = sidecar.header.indexToWorld;
+        volume.anchor = sidecar.anchor;
+    } else {
+        DensityOptions densityOptions;
+        densityOptions.gridNamed = options.gridNamed;
+        densityOptions.gridName = options.gridName;
+        densityOptions.repair = options.repair | (haveSidecar ? sidecar.header.repair : 0u);
+        densityOptions.maxMemory = options.maxMemory;
+        Density density = loadDensity(vdbPath, densityOptions);
+        checkScale(options.scale, density.summary.max, vdbPath);
+        if (haveSidecar) {
+            sidecar = readSidecar(volume.sidecarPath, &density.summary, options.check);
+        }
+        volume.grid = density.summary.grid;
+        volume.indexToWorld = density.summary.indexToWorld;
+        volume.anchor = density.summary.anchor;
+        volume.activeVoxels = density.summary.activeVoxels;
+        volume.field = std::move(density.field);
+        volume.hasDensity = true;
+    }
+    volume.worldToIndex = volume.indexToWorld.inverse();
+    if (haveSidecar) {
+        checkScale(options.scale, maxDensity(sidecar.baked), volume.sidecarPath);
+        volume.superVoxels = SuperVoxels(std::move(sidecar.baked), options.scale, options.choice,
+                                         volume.indexToWorld.longestDiagonal());
+        volume.hasSuperVoxels = true;
+    }
+    checkMemory(volume.bytes(), options.maxMemory, vdbPath ? vdbPath : volume.sidecarPath);
+    return volume;
+}
+
+}  // namespace trk

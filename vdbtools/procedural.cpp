@@ -1,0 +1,305 @@
+// SPDX-License-Identifier: Apache-2.0
+#include "procedural.h"
+
+#include "error.h"
+#include "math.h"
+
+#include <openvdb/openvdb.h>
+#include <tbb/blocked_range.h>
+#include <tbb/parallel_for.h>
+
+#include <algorithm>
+#include <array>
+#include <atomic>
+#include <cmath>
+#include <fstream>
+#include <memory>
+#include <random>
+
+namespace vdbtools {
+namespace {
+
+using trk::Vec3d;
+
+constexpr double kBoxSize = 10;  // world units
+
+double smoothStep(double lo, double hi, double x) {
+    const double t = std::min(std::max((x - lo) / (hi - lo), 0.0), 1.0);
+    return t * t * (3 - 2 * t);
+}
+
+/// Gradient noise on the integer lattice with a quintic fade [Perlin 2002]; about -1 to 1.
+class Noise {
+  public:
+    explicit Noise(uint64_t seed) {
+        std::mt19937_64 random(seed);
+        for (size_t i = 0; i < 256; ++i) {
+            permutation_[i] = static_cast<uint8_t>(i);
+        }
+        for (size_t i = 255; i > 0; --i) {
+            std::swap(permutation_[i], permutation_[random() % (i + 1)]);
+        }
+    }
+
+    double operator()(const Vec3d& p) const {
+        int cell[3];
+        double f[3];
+        double fade[3];
+        for (int a = 0; a < 3; ++a) {
+            const double floor = std::floor(p[a]);
+            cell[a] = static_cast<int>(floor);
+            f[a] = p[a] - floor;
+            fade[a] = f[a] * f[a] * f[a] * (f[a] * (f[a] * 6 - 15) + 10);
+        }
+        double value = 0;
+        for (int corner = 0; corner < 8; ++corner) {
+            const int x = corner >> 2;
+            const int y = corner >> 1 & 1;
+            const int z = corner & 1;
+            const double weight = (x ? fade[0] : 1 - fade[0]) * (y ? fade[1] : 1 - fade[1]) *
+                                  (z ? fade[2] : 1 - fade[2]);
+            value += weight *
+                     gradient(cell[0] + x, cell[1] + y, cell[2] + z, f[0] - x, f[1] - y, f[2] - z);
+        }
+        return value;
+    }
+
+    /// Sum of octaves, each twice as fine and `gain` times as strong; about -1 to 1.
+    double octaves(Vec3d p, int count, double gain) const {
+        double sum = 0;
+        double amplitude = 1;
+        double total = 0;
+        for (int i = 0; i < count; ++i) {
+            sum += amplitude * (*this)(p);
+            total += amplitude;
+            amplitude *= gain;
+            p = 2.03 * p + Vec3d{{17.1, 5.3, 29.7}};
+        }
+        return sum / total;
+    }
+
+    /// The same of 1 - |noise|, squared: creases between billows. 0 to 1.
+    double billows(Vec3d p, int count, double gain) const {
+        double sum = 0;
+        double amplitude = 1;
+        double total = 0;
+        for (int i = 0; i < count; ++i) {
+            const double n = 1 - std::fabs((*this)(p));
+            sum += amplitude * n * n;
+            total += amplitude;
+            amplitude *= gain;
+            p = 2.11 * p + Vec3d{{31.4, 15.9, 2.65}};
+        }
+        return sum / total;
+    }
+
+  private:
+    double gradient(int x, int y, int z, double fx, double fy, double fz) const {
+        const auto at = [&](int i) { return permutation_[static_cast<size_t>(i & 255)]; };
+        const int hash = at(at(at(x) + y) + z) & 15;
+        const double u = hash < 8 ? fx : fy;
+        const double v = hash < 4 ? fy : hash == 12 || hash == 14 ? fx : fz;
+        return (hash & 1 ? -u : u) + (hash & 2 ? -v : v);
+    }
+
+    std::array<uint8_t, 256> permutation_{};
+};
+
+/// A density on the unit cube, y up.
+class Shape {
+  public:
+    virtual ~Shape() = default;
+    /// Whether the density is 0 within `radius` of `centre`; may answer false too often.
+    virtual bool emptyAround(const Vec3d& centre, double radius) const = 0;
+    virtual double density(const Vec3d& p) const = 0;
+};
+
+class Cloud : public Shape {
+  public:
+    explicit Cloud(uint64_t seed) : noise_(seed) {
+        // Large balls along a flat base, smaller ones budding from the upper half of earlier ones.
+        std::mt19937_64 random(seed * 7919 + 1);
+        std::uniform_real_distribution<double> unit(0, 1);
+        for (int i = 0; i < 7; ++i) {
+            const double angle = 6.2831853 * (i + 0.6 * unit(random)) / 7;
+            const double reach = 0.19 * std::sqrt(unit(random));
+            const double radius = 0.11 + 0.055 * unit(random);
+            balls_.push_back({{{0.5 + 1.15 * reach * std::cos(angle), 0.31 + 0.05 * unit(random),
+                                0.5 + 0.85 * reach * std::sin(angle)}},
+                              radius});
+        }
+        balls_.push_back({{{0.5, 0.42, 0.5}}, 0.17});
+        for (int i = 0; i < 60; ++i) {
+            const Ball parent = balls_[random() % balls_.size()];
+            const double angle = 6.2831853 * unit(random);
+            const double rise = 0.05 + 0.9 * unit(random);
+            const double flat = std::sqrt(1 - rise * rise);
+            const double radius = std::max(parent.radius * (0.45 + 0.3 * unit(random)), 0.035);
+            const Vec3d direction{{flat * std::cos(angle), rise, flat * std::sin(angle)}};
+            const Vec3d centre = parent.centre + 0.95 * parent.radius * direction;
+            if (centre[1] + radius < 0.84 && std::fabs(centre[0] - 0.5) + radius < 0.4 &&
+                std::fabs(centre[2] - 0.5) + radius < 0.4) {
+                balls_.push_back({centre, radius});
+            }
+        }
+    }
+
+    bool emptyAround(const Vec3d& centre, double radius) const override {
+        return std::none_of(balls_.begin(), balls_.end(), [&](const Ball& ball) {
+            return length(centre - ball.centre) < ball.radius * kReach + radius + kWarp;
+        });
+    }
+
+    double density(const Vec3d& p) const override {
+        const Vec3d low{{noise_(5.0 * p), noise_(5.0 * p + Vec3d{{40, 0, 0}}),
+                         noise_(5.0 * p + Vec3d{{0, 40, 0}})}};
+        const Vec3d q = p + 0.6 * kWarp * low;
+        // Depth below the surface of the nearest ball, in radii; smaller balls keep finer detail.
+        double depth = -1;
+        for (const Ball& ball : balls_) {
+            depth = std::max(depth, 1 - length(q - ball.centre) / ball.radius);
+        }
+        if (depth < 1 - kReach) {
+            return 0;
+        }
+        const double detail = noise_.billows(9.0 * p, 6, 0.55);
+        const double base = smoothStep(0.24, 0.3, p[1] + 0.02 * low[0]);
+        const double shaped = depth + 0.62 * (detail - 0.62) - 0.35 * (1 - base);
+        return smoothStep(0.0, 0.16, shaped) * (0.55 + 0.45 * smoothStep(0.3, 0.8, detail));
+    }
+
+  private:
+    struct Ball {
+        Vec3d centre;
+        double radius;
+    };
+    static constexpr double kReach = 1.25;  // radii that the detail adds at most
+    static constexpr double kWarp = 0.03;
+
+    Noise noise_;
+    std::vector<Ball> balls_;
+};
+
+class Smoke : public Shape {
+  public:
+    explicit Smoke(uint64_t seed) : noise_(seed) {}
+
+    bool emptyAround(const Vec3d& centre, double radius) const override {
+        const double lo = std::max(centre[1] - radius, 0.0);
+        const double hi = centre[1] + radius;
+        const double x = centre[0] - 0.5;
+        const double z = centre[2] - 0.5;
+        return hi < 0.05 || lo > 0.97 ||
+               std::sqrt(x * x + z * z) - radius > 1.6 * width(std::min(hi, 1.0)) + drift(hi);
+    }
+
+    double density(const Vec3d& p) const override {
+        const double height = std::max(p[1], 0.0);
+        // Rising air folds what it carries: warp the plume by noise that grows with height, twice.
+        const Vec3d slow{{2.2 * p[0], 1.5 * p[1], 2.2 * p[2]}};
+        const Vec3d sway = warp(slow, 2);
+        Vec3d q = p + drift(height) * sway;
+        q = q + 0.4 * drift(height) * warp(5.5 * q, 3);
+        const double x = q[0] - 0.5;
+        const double z = q[2] - 0.5;
+        const double r = std::sqrt(x * x + z * z) / width(height);
+        if (r > 1.3) {
+            return 0;
+        }
+        const Vec3d stretched{{9 * q[0], 4.5 * q[1], 9 * q[2]}};
+        const double sheets = noise_.billows(stretched + 0.5 * warp(stretched, 2), 5, 0.6);
+        const double wisps = smoothStep(0.42 + 0.22 * r + 0.14 * height, 0.95, sheets);
+        const double core = std::exp(-2.2 * r * r);
+        const double ends = smoothStep(0.05, 0.09, p[1]) * (1 - smoothStep(0.72, 0.95, p[1]));
+        const double thinning = 0.25 + 0.75 * std::exp(-2.5 * height);
+        return ends * thinning * core * wisps * (1 - smoothStep(1.0, 1.3, r));
+    }
+
+  private:
+    static double width(double height) { return 0.045 + 0.26 * std::pow(height, 1.2); }
+    static double drift(double height) { return 0.02 + 0.16 * std::max(height, 0.0); }
+
+    Vec3d warp(const Vec3d& p, int octaves) const {
+        return {{noise_.octaves(p, octaves, 0.5),
+                 0.5 * noise_.octaves(p + Vec3d{{51.7, 3.1, 9.2}}, octaves, 0.5),
+                 noise_.octaves(p + Vec3d{{7.7, 61.3, 27.4}}, octaves, 0.5)}};
+    }
+
+    Noise noise_;
+};
+
+std::unique_ptr<Shape> makeShape(const ProceduralOptions& options) {
+    if (options.kind == "smoke") {
+        return std::make_unique<Smoke>(options.seed);
+    }
+    return std::make_unique<Cloud>(options.seed);
+}
+
+}  // namespace
+
+const std::vector<std::string>& proceduralKinds() {
+    static const std::vector<std::string> kinds{"cloud", "smoke"};
+    return kinds;
+}
+
+ProceduralSummary writeProcedural(const ProceduralOptions& options, const trk::OutputFile& file,
+                                  const std::function<void(double)>& progress) {
+    using Leaf = openvdb::FloatTree::LeafNodeType;
+    openvdb::initialize();
+    const std::unique_ptr<Shape> shape = makeShape(options);
+    const double voxel = 1.0 / options.voxels;  // in the unit cube
+    const int blocks = (options.voxels + 7) / 8;
+    std::vector<std::unique_ptr<Leaf>> leaves(
+        static_cast<size_t>(blocks) * static_cast<size_t>(blocks) * static_cast<size_t>(blocks));
+    std::atomic<int> done{0};
+    tbb::parallel_for(tbb::blocked_range<int>(0, blocks * blocks), [&](const auto& range) {
+        for (int column = range.begin(); column != range.end(); ++column) {
+            for (int k = 0; k < blocks; ++k) {
+                const openvdb::Coord origin(8 * (column / blocks), 8 * (column % blocks), 8 * k);
+                const Vec3d centre{
+                    {(origin.x() + 4) * voxel, (origin.y() + 4) * voxel, (origin.z() + 4) * voxel}};
+                if (shape->emptyAround(centre, 7 * voxel)) {
+                    continue;
+                }
+                auto leaf = std::make_unique<Leaf>(origin, 0.0f);
+                for (openvdb::Index i = 0; i < Leaf::SIZE; ++i) {
+                    const openvdb::Coord at = leaf->offsetToGlobalCoord(i);
+                    const double d = shape->density(
+                        {{(at.x() + 0.5) * voxel, (at.y() + 0.5) * voxel, (at.z() + 0.5) * voxel}});
+                    const bool inside = std::max({at.x(), at.y(), at.z()}) < options.voxels;
+                    if (inside && d > 1e-4) {
+                        leaf->setValueOn(i, static_cast<float>(d));
+                    }
+                }
+                if (!leaf->isEmpty()) {
+                    leaves[static_cast<size_t>(column) * static_cast<size_t>(blocks) +
+                           static_cast<size_t>(k)] = std::move(leaf);
+                }
+            }
+            progress(static_cast<double>(++done) / (blocks * blocks));
+        }
+    });
+    auto grid = openvdb::FloatGrid::create();
+    for (auto& leaf : leaves) {
+        if (leaf) {
+            grid->tree().addLeaf(leaf.release());
+        }
+    }
+    ProceduralSummary summary;
+    summary.voxelSize = kBoxSize / options.voxels;
+    summary.activeVoxels = grid->activeVoxelCount();
+    grid->setName("density");
+    grid->setGridClass(openvdb::GRID_FOG_VOLUME);
+    grid->setTransform(openvdb::math::Transform::createLinearTransform(summary.voxelSize));
+    openvdb::MetaMap metadata;
+    metadata.insertMeta("creator", openvdb::StringMetadata("vdbtrack " TRACK_VERSION));
+    try {
+        openvdb::io::File out(file.path());
+        out.write(openvdb::GridCPtrVec{grid}, metadata);
+    } catch (const std::exception& e) {
+        throw trk::Error(TRK_ERROR_IO, file.target() + ": cannot be written: " + e.what());
+    }
+    return summary;
+}
+
+}  // namespace vdbtools

@@ -1,0 +1,318 @@
+// SPDX-License-Identifier: Apache-2.0
+#include "verify.h"
+
+#include "io/tree_regions.h"
+#include "io/vdb_file.h"
+
+#include <tbb/blocked_range.h>
+#include <tbb/parallel_for.h>
+
+#include <atomic>
+#include <cmath>
+#include <sstream>
+#include <vector>
+
+namespace vdbtools {
+namespace {
+
+using trk::BakedSuperVoxel;
+using trk::Int3;
+using trk::IntBox;
+using trk::SparseTable;
+
+std::ostream& operator<<(std::ostream& out, const Int3& p) {
+    return out << "(" << p[0] << ", " << p[1] << ", " << p[2] << ")";
+}
+
+/// Everything in index space here; `table` alone is in local space.
+template <class TreeType>
+class Verifier {
+  public:
+    using Regions = trk::TreeRegions<TreeType>;
+
+    Verifier(const TreeType& tree, const trk::Sidecar& sidecar)
+        : tree_(tree), sidecar_(sidecar), size_(sidecar.baked.superVoxelSize()) {}
+
+    VerifyReport run() {
+        VerifyReport report;
+        std::vector<Place> places;
+        sidecar_.baked.table.forEach([&](const Int3& local, int shift, SparseTable::Entry entry) {
+            places.push_back({toIndex(local), shift, entry - 1});
+        });
+        report.superVoxels = places.size();
+        std::atomic<uint64_t> vertices{0};
+        const size_t badPlace = firstFailure(places.size(), [&](Regions& regions, size_t i) {
+            uint64_t count = 0;
+            const std::string wrong = checkPlace(regions, places[i], count);
+            vertices += count;
+            return !wrong.empty();
+        });
+        report.vertices = vertices;
+        if (badPlace < places.size()) {
+            Regions regions(tree_);
+            uint64_t count = 0;
+            report.counterexample = checkPlace(regions, places[badPlace], count);
+            return report;
+        }
+        std::vector<IntBox> blocks;  // of voxels that are not all 0
+        collectBlocks(blocks);
+        const size_t badBlock = firstFailure(blocks.size(), [&](Regions& regions, size_t i) {
+            return !checkCoverage(regions, blocks[i]).empty();
+        });
+        if (badBlock < blocks.size()) {
+            Regions regions(tree_);
+            report.counterexample = checkCoverage(regions, blocks[badBlock]);
+            return report;
+        }
+        report.holds = true;
+        return report;
+    }
+
+  private:
+    struct Place {
+        Int3 origin;
+        int shift;
+        size_t item;
+    };
+
+    Int3 toIndex(const Int3& local) const {
+        return {{local[0] + sidecar_.anchor[0], local[1] + sidecar_.anchor[1],
+                 local[2] + sidecar_.anchor[2]}};
+    }
+
+    /// Lowest i in [0, count) for which `fails(regions, i)`, or count.
+    template <class Fails>
+    size_t firstFailure(size_t count, const Fails& fails) const {
+        std::atomic<size_t> first{count};
+        tbb::parallel_for(tbb::blocked_range<size_t>(0, count, 16),
+                          [&](const tbb::blocked_range<size_t>& range) {
+                              Regions regions(tree_);
+                              for (size_t i = range.begin(); i != range.end(); ++i) {
+                                  if (i < first && fails(regions, i)) {
+                                      size_t known = first;
+                                      while (i < known && !first.compare_exchange_weak(known, i)) {
+                                      }
+                                  }
+                              }
+                          });
+        return first;
+    }
+
+    float vertex(Regions& regions, const Int3& at) const {
+        const auto v = static_cast<float>(regions.value(at));
+        return v > 0 && std::isfinite(v) ? v : 0.0f;  // repaired, where the sidecar says so
+    }
+
+    std::string checkPlace(Regions& regions, const Place& place, uint64_t& vertices) const {
+        const BakedSuperVoxel& item = sidecar_.baked.items[place.item];
+        const int64_t edge = int64_t{1} << place.shift;
+        if (edge > size_) {
+            return checkUniform(regions, place, item, vertices);
+        }
+        double sum = 0;
+        double squares = 0;
+        const auto weight = [&](int64_t i) { return i == 0 || i == edge ? 0.5 : 1.0; };
+        for (int64_t x = 0; x <= edge; ++x) {
+            for (int64_t y = 0; y <= edge; ++y) {
+                for (int64_t z = 0; z <= edge; ++z) {
+                    const Int3 at{{place.origin[0] + x, place.origin[1] + y, place.origin[2] + z}};
+                    const float v = vertex(regions, at);
+                    ++vertices;
+                    const std::string wrong = checkVertex(item, place, at, v);
+                    if (!wrong.empty()) {
+                        return wrong;
+                    }
+                    const double w = weight(x) * weight(y) * weight(z);
+                    const double residual =
+                        static_cast<double>(v) - static_cast<double>(item.control);
+                    sum += w * static_cast<double>(v);
+                    squares += w * residual * residual;
+                }
+            }
+        }
+        const auto cells = static_cast<double>(edge * edge * edge);
+        const double mean = sum / cells;
+        const double rms = std::sqrt(squares / cells);
+        const double control = static_cast<double>(item.control);
+        std::ostringstream line;
+        // Float rounding, plus that of summing in another order than the bake.
+        if (std::fabs(control - mean) > 1e-6 * mean + 1e-38) {
+            line << name(place) << ": control " << item.control << ", but the mean is " << mean;
+        } else if (rms > static_cast<double>(item.rms) * (1 + 1e-6) + 1e-7 * mean + 1e-38) {
+            line << name(place) << ": RMS " << item.rms << ", but it is " << rms;
+        }
+        return line.str();
+    }
+
+    /// A place larger than a super-voxel claims one value everywhere, faces included.
+    std::string checkUniform(Regions& regions, const Place& place, const BakedSuperVoxel& item,
+                             uint64_t& vertices) const {
+        const int64_t edge = int64_t{1} << place.shift;
+        std::string wrong;
+        const IntBox closed{
+            place.origin,
+            {{place.origin[0] + edge + 1, place.origin[1] + edge + 1, place.origin[2] + edge + 1}}};
+        forEachRegion(regions, place.origin, place.shift + 1, closed,
+                      [&](const Int3& at, float value) {
+                          ++vertices;
+                          wrong = checkVertex(item, place, at, value);
+                          return wrong.empty();
+                      });
+        return wrong;
+    }
+
+    /// Calls `f(at, value)` for every uniform region, or else voxel, of the aligned region of
+    /// 2^shift voxels at `origin` that meets `box`, until it answers false.
+    template <class F>
+    bool forEachRegion(Regions& regions, const Int3& origin, int shift, const IntBox& box,
+                       const F& f) const {
+        const int64_t edge = int64_t{1} << shift;
+        for (size_t a = 0; a < 3; ++a) {
+            if (origin[a] >= box.hi[a] || origin[a] + edge <= box.lo[a]) {
+                return true;
+            }
+        }
+        if (shift == 0) {
+            return f(origin, vertex(regions, origin));
+        }
+        if (shift >= 3) {
+            if (regions.uniform(origin, shift)) {
+                return f(origin, vertex(regions, origin));
+            }
+        }
+        for (int64_t octant = 0; octant < 8; ++octant) {
+            const int64_t half = edge / 2;
+            const Int3 part{{origin[0] + (octant >> 2) * half, origin[1] + (octant >> 1 & 1) * half,
+                             origin[2] + (octant & 1) * half}};
+            if (!forEachRegion(regions, part, shift - 1, box, f)) {
+                return false;
+            }
+        }
+        return true;
+    }
+
+    std::string name(const Place& place) const {
+        std::ostringstream text;
+        text << "super-voxel "
+             << Int3{{place.origin[0] / size_, place.origin[1] / size_, place.origin[2] / size_}};
+        return text.str();
+    }
+
+    std::string checkVertex(const BakedSuperVoxel& item, const Place& place, const Int3& at,
+                            float v) const {
+        std::ostringstream line;
+        const auto report = [&](const char* bound, float value) {
+            line << name(place) << ": " << bound << " " << value << ", but voxel " << at << " is "
+                 << v;
+        };
+        line.precision(9);
+        const double residual = static_cast<double>(v) - static_cast<double>(item.control);
+        if (v < item.min) {
+            report("min", item.min);
+        } else if (v > item.max) {
+            report("max", item.max);
+        } else if (std::fabs(residual) > static_cast<double>(item.majorant)) {
+            report("majorant", item.majorant);
+        }
+        return line.str();
+    }
+
+    void collectBlocks(std::vector<IntBox>& blocks) const {
+        const auto add = [&](const openvdb::Coord& at, int64_t edge) {
+            const Int3 lo = trk::toInt3(at);
+            blocks.push_back({lo, {{lo[0] + edge, lo[1] + edge, lo[2] + edge}}});
+        };
+        for (auto leaf = tree_.cbeginLeaf(); leaf; ++leaf) {
+            add(leaf->origin(), 8);
+        }
+        auto tile = tree_.cbeginValueAll();
+        tile.setMaxDepth(openvdb::FloatTree::ValueAllCIter::LEAF_DEPTH - 1);
+        for (; tile; ++tile) {
+            if (!(tile.getValue() == 0)) {
+                openvdb::CoordBBox box;
+                tile.getBoundingBox(box);
+                add(box.min(), box.dim().x());
+            }
+        }
+    }
+
+    /// Every super-voxel that a voxel above 0 belongs to must be occupied.
+    std::string checkCoverage(Regions& regions, const IntBox& block) const {
+        const int64_t edge = block.hi[0] - block.lo[0];
+        std::ostringstream line;
+        const auto report = [&](const Int3& superVoxel, const Int3& at, float v) {
+            line << "super-voxel " << superVoxel << ": not in the sidecar, but its voxel " << at
+                 << " is " << v;
+        };
+        if (edge > 8) {  // a tile
+            const float v = vertex(regions, block.lo);
+            IntBox touched;
+            for (size_t a = 0; a < 3; ++a) {
+                touched.lo[a] = (block.lo[a] - 1 - sidecar_.anchor[a]) & ~(size_ - 1);
+                touched.hi[a] = block.hi[a] - sidecar_.anchor[a];
+            }
+            const auto empty = v > 0 ? firstEmpty(touched) : std::nullopt;
+            if (empty) {
+                const Int3 at = toIndex(*empty);
+                report({{at[0] / size_, at[1] / size_, at[2] / size_}}, block.lo, v);
+            }
+            return line.str();
+        }
+        for (int64_t i = 0; i < 512; ++i) {
+            const Int3 at{
+                {block.lo[0] + (i >> 6), block.lo[1] + (i >> 3 & 7), block.lo[2] + (i & 7)}};
+            const float v = vertex(regions, at);
+            for (int corner = 0; v > 0 && corner < 8; ++corner) {
+                Int3 cell = at;
+                for (size_t a = 0; a < 3; ++a) {
+                    cell[a] -= (corner >> a & 1) + sidecar_.anchor[a];
+                }
+                if (sidecar_.baked.table.find(cell[0], cell[1], cell[2]).entry ==
+                    SparseTable::kEmpty) {
+                    const Int3 global = toIndex(cell);
+                    const int64_t n = size_;
+                    const auto down = [n](int64_t x) { return (x - (x % n + n) % n) / n; };
+                    report({{down(global[0]), down(global[1]), down(global[2])}}, at, v);
+                    return line.str();
+                }
+            }
+        }
+        return {};
+    }
+
+    /// A place in `box` (local) where the table is empty, found by its regions.
+    std::optional<Int3> firstEmpty(const IntBox& box) const {
+        for (Int3 at = box.lo; at[0] < box.hi[0]; at[0] += size_) {
+            for (at[1] = box.lo[1]; at[1] < box.hi[1]; at[1] += size_) {
+                for (at[2] = box.lo[2]; at[2] < box.hi[2];) {
+                    const auto found = sidecar_.baked.table.find(at[0], at[1], at[2]);
+                    if (found.entry == SparseTable::kEmpty) {
+                        return at;
+                    }
+                    const int64_t edge = int64_t{1} << found.shift;
+                    at[2] = (at[2] / edge + 1) * edge;
+                }
+            }
+        }
+        return std::nullopt;
+    }
+
+    const TreeType& tree_;
+    const trk::Sidecar& sidecar_;
+    int64_t size_;
+};
+
+}  // namespace
+
+VerifyReport verify(const trk::DensitySummary& density, const trk::Sidecar& sidecar) {
+    trk::VdbFile file(density.path);
+    const trk::VdbEntry& entry =
+        file.select(density.grid.name + "[" + std::to_string(density.grid.index) + "]");
+    const openvdb::GridBase::Ptr grid = file.read(entry);
+    if (density.valueType == "double") {
+        return Verifier(static_cast<const openvdb::DoubleGrid&>(*grid).constTree(), sidecar).run();
+    }
+    return Verifier(static_cast<const openvdb::FloatGrid&>(*grid).constTree(), sidecar).run();
+}
+
+}  // namespace vdbtools

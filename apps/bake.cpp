@@ -89,7 +89,7 @@ void run(const Command& command, const std::vector<std::string>& given) {
                   << " is empty; its sidecar holds nothing and its transmittance is 1\n";
     }
     if (!arguments.quiet()) {
-        std::cerr << output << ": " << baked.items.size() << " super-voxels of " << size
+        std::cerr << output << ": " << baked.table.occupiedItems() << " super-voxels of " << size
                   << "^3 voxels, " << levels << " levels, "
                   << byteCount(std::filesystem::file_size(output));
         if (summary.dropped + summary.clamped > 0) {

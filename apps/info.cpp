@@ -71,7 +71,7 @@ Json describeSidecar(const std::string& path) {
     json["tool_version"] = header.toolVersion;
     json["control"] = header.controlKind;
     json["super_voxel_size"] = header.superVoxelSize;
-    json["super_voxels"] = sidecar.baked.items.size();
+    json["super_voxels"] = sidecar.baked.table.occupiedItems();
     json["levels"] = header.levels;
     json["voxel_size"] = {length(header.indexToWorld.column(0)),
                           length(header.indexToWorld.column(1)),

@@ -7,8 +7,8 @@
 #include <algorithm>
 #include <cmath>
 #include <limits>
-#include <map>
 #include <optional>
+#include <unordered_map>
 #include <vector>
 
 namespace vdbtools {
@@ -18,7 +18,7 @@ using trk::BakedSuperVoxel;
 using trk::BakedVolume;
 using trk::ExtinctionField;
 using trk::Int3;
-using trk::PreviewLevel;
+using trk::ScalarTable;
 using trk::SparseTable;
 
 constexpr float kInfinity = std::numeric_limits<float>::infinity();
@@ -98,11 +98,12 @@ class Baker {
         BakedVolume baked;
         baked.superVoxelShift = shift_;
         SparseTable plan(shift_, field_.box());
-        std::vector<Int3> origins;
-        std::map<float, SparseTable::Entry> constants;
-        std::vector<float> constantValues;
-        // Constant regions become one item each value; every other super-voxel is a job.
-        constexpr SparseTable::Entry kConstant = ExtinctionField::kConstantFlag;
+        std::vector<Int3> jobs;
+        const auto addJob = [&](const Int3& origin) {
+            jobs.push_back(origin);
+            return static_cast<SparseTable::Entry>(jobs.size());
+        };
+        std::unordered_map<SparseTable::Entry, SparseTable::Entry> constants;
         plan.fill(
             [&](const Int3& origin, int shift) -> std::optional<SparseTable::Entry> {
                 const auto entry = field_.table().uniformEntry(origin, shift);
@@ -112,39 +113,30 @@ class Baker {
                 if (*entry == SparseTable::kEmpty) {
                     return SparseTable::kEmpty;
                 }
-                const auto [it, isNew] = constants.try_emplace(
-                    field_.constant(*entry),
-                    static_cast<SparseTable::Entry>(constantValues.size()) | kConstant);
-                if (isNew) {
-                    constantValues.push_back(it->first);
-                }
-                return it->second;
+                SparseTable::Entry& known = constants[*entry];
+                known = known == SparseTable::kEmpty ? addJob(origin) : known;
+                return known;
             },
-            [&](const Int3& origin) {
-                origins.push_back(origin);
-                return static_cast<SparseTable::Entry>(origins.size());
+            addJob,
+            // The surface of a large tile repeats a handful of patterns of bricks.
+            [&](const Int3& origin, int shift, SparseTable::Key& key) {
+                field_.table().appendKey(origin, shift, key);
             });
-        std::vector<BakedSuperVoxel> results(origins.size());
-        tbb::parallel_for(tbb::blocked_range<size_t>(0, origins.size(), 32),
+        std::vector<BakedSuperVoxel> results(jobs.size());
+        tbb::parallel_for(tbb::blocked_range<size_t>(0, jobs.size(), 32),
                           [&](const tbb::blocked_range<size_t>& range) {
                               for (size_t i = range.begin(); i != range.end(); ++i) {
-                                  results[i] = superVoxel(origins[i]);
+                                  results[i] = superVoxel(jobs[i]);
                               }
                           });
-        for (const float value : constantValues) {
-            baked.items.push_back(finish(constantMoments(value)));
+        std::vector<SparseTable::Entry> itemOf(jobs.size(), SparseTable::kEmpty);
+        for (size_t i = 0; i < jobs.size(); ++i) {
+            if (results[i].max > 0) {
+                baked.items.push_back(results[i]);
+                itemOf[i] = static_cast<SparseTable::Entry>(baked.items.size());
+            }
         }
-        baked.table = plan.mapped([&](SparseTable::Entry entry) {
-            if (entry & kConstant) {
-                return (entry & ~kConstant) + 1;
-            }
-            const BakedSuperVoxel& result = results[entry - 1];
-            if (result.max == 0) {
-                return SparseTable::kEmpty;
-            }
-            baked.items.push_back(result);
-            return static_cast<SparseTable::Entry>(baked.items.size());
-        });
+        baked.table = plan.mapped([&](SparseTable::Entry entry) { return itemOf[entry - 1]; });
         return baked;
     }
 
@@ -244,17 +236,22 @@ class Baker {
 
 /// Means of the super-voxels twice as large as those of `finer`.
 template <class MeanOf>
-PreviewLevel nextLevel(const SparseTable& finer, const trk::IntBox& box, const MeanOf& meanOf) {
-    PreviewLevel level;
+ScalarTable nextLevel(const SparseTable& finer, const trk::IntBox& box, const MeanOf& meanOf) {
+    ScalarTable level;
     const int shift = finer.itemShift() + 1;
     const int64_t half = int64_t{1} << finer.itemShift();
     level.table = SparseTable(shift, box);
+    std::unordered_map<float, SparseTable::Entry> known;
     const auto add = [&](float mean) {
         if (mean == 0) {
             return SparseTable::kEmpty;
         }
-        level.mean.push_back(mean);
-        return static_cast<SparseTable::Entry>(level.mean.size());
+        const auto [it, isNew] =
+            known.try_emplace(mean, static_cast<SparseTable::Entry>(level.values.size() + 1));
+        if (isNew) {
+            level.values.push_back(mean);
+        }
+        return it->second;
     };
     level.table.fill(
         [&](const Int3& origin, int regionShift) -> std::optional<SparseTable::Entry> {
@@ -275,6 +272,9 @@ PreviewLevel nextLevel(const SparseTable& finer, const trk::IntBox& box, const M
                 sum += entry == SparseTable::kEmpty ? 0 : static_cast<double>(meanOf(entry));
             }
             return add(static_cast<float>(sum / 8));
+        },
+        [&](const Int3& origin, int regionShift, SparseTable::Key& key) {
+            finer.appendKey(origin, regionShift, key);
         });
     return level;
 }
@@ -289,9 +289,10 @@ BakedVolume bake(const ExtinctionField& field, int superVoxelSize, int levels) {
                 return baked.items[e - 1].control;
             }));
         } else {
-            const PreviewLevel& finer = baked.levels.back();
-            baked.levels.push_back(nextLevel(
-                finer.table, field.box(), [&](SparseTable::Entry e) { return finer.mean[e - 1]; }));
+            const ScalarTable& finer = baked.levels.back();
+            baked.levels.push_back(nextLevel(finer.table, field.box(), [&](SparseTable::Entry e) {
+                return finer.values[e - 1];
+            }));
         }
     }
     return baked;

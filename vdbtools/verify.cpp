@@ -9,6 +9,7 @@
 
 #include <atomic>
 #include <cmath>
+#include <optional>
 #include <sstream>
 #include <vector>
 
@@ -37,9 +38,9 @@ class Verifier {
         VerifyReport report;
         std::vector<Place> places;
         sidecar_.baked.table.forEach([&](const Int3& local, int shift, SparseTable::Entry entry) {
-            places.push_back({toIndex(local), shift, entry - 1});
+            addPlaces(toIndex(local), shift, entry - 1, places);
         });
-        report.superVoxels = places.size();
+        report.superVoxels = sidecar_.baked.table.occupiedItems();
         std::atomic<uint64_t> vertices{0};
         const size_t badPlace = firstFailure(places.size(), [&](Regions& regions, size_t i) {
             uint64_t count = 0;
@@ -74,6 +75,18 @@ class Verifier {
         int shift;
         size_t item;
     };
+
+    /// A region of equal super-voxels is one place if they claim to be constant, else one each.
+    void addPlaces(const Int3& origin, int shift, size_t item, std::vector<Place>& places) const {
+        const BakedSuperVoxel& v = sidecar_.baked.items[item];
+        if (v.min == v.max || shift == sidecar_.baked.superVoxelShift) {
+            places.push_back({origin, shift, item});
+            return;
+        }
+        for (size_t c = 0; c < 512; ++c) {
+            addPlaces(SparseTable::childOrigin(origin, shift - 3, c), shift - 3, item, places);
+        }
+    }
 
     Int3 toIndex(const Int3& local) const {
         return {{local[0] + sidecar_.anchor[0], local[1] + sidecar_.anchor[1],

@@ -13,7 +13,7 @@ namespace vdbtools {
 struct VerifyReport {
     bool holds = false;
     std::string counterexample;  ///< the first, where the bounds do not hold
-    uint64_t superVoxels = 0;    ///< occupied, tiles counted once
+    uint64_t superVoxels = 0;    ///< occupied
     uint64_t vertices = 0;       ///< compared with bounds
 };
 

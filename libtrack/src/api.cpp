@@ -240,7 +240,7 @@ TrkStatus trkGetVolumeInfo(const TrkVolume* handle, TrkVolumeInfo* info) {
         result.storage = !volume.hasDensity ? "" : volume.field.isHalf() ? "half" : "float";
         if (volume.hasSuperVoxels) {
             result.superVoxelSize = static_cast<uint32_t>(volume.superVoxels.size());
-            result.superVoxelCount = static_cast<uint32_t>(volume.superVoxels.count());
+            result.superVoxelCount = volume.superVoxels.count();
             result.levels = static_cast<uint32_t>(volume.superVoxels.levelCount());
             result.controlKind = "constant";
         }

@@ -3,6 +3,7 @@
 // (whose items are bricks of 8^3 voxels) and the super-voxels (items of N^3 voxels) live in one.
 #pragma once
 
+#include "hash.h"
 #include "math.h"
 
 #include <array>
@@ -72,42 +73,98 @@ class SparseTable {
         return root_.capacity() * sizeof(Entry) + nodes_.capacity() * sizeof(Node);
     }
 
+    /// What the contents of a region follow from; equal keys, equal contents. Empty: nothing known.
+    using Key = std::vector<Entry>;
+
     /// Fills the table top down. `uniform(origin, shift)` answers for the region of 2^shift voxels:
     /// an entry that stands for all of it, or nothing, whereupon its eight times eight times eight
-    /// parts are asked; `item(origin)` answers where items are not uniform.
+    /// parts are asked; `item(origin)` answers where items are not uniform. `key(origin, shift,
+    /// out)` may append what a region's contents follow from: regions with equal keys are built
+    /// once.
+    template <class Uniform, class Item, class KeyOf>
+    void fill(Uniform&& uniform, Item&& item, KeyOf&& keyOf) {
+        Memo memo;
+        forEachRootRegion([&](size_t i, const Int3& origin) {
+            root_[i] = build(origin, rootShift_, uniform, item, keyOf, memo);
+        });
+        nodes_.shrink_to_fit();
+        known_.clear();
+    }
     template <class Uniform, class Item>
     void fill(Uniform&& uniform, Item&& item) {
-        forEachRootRegion([&](size_t i, const Int3& origin) {
-            root_[i] = build(origin, rootShift_, uniform, item);
-        });
+        fill(uniform, item, [](const Int3&, int, Key&) {});
     }
 
-    /// Adds a node, or only answers its entry where all children are the same tile.
+    /// Appends what this table holds in a region: a key for tables derived from it.
+    void appendKey(const Int3& origin, int shift, Key& key) const {
+        if (root_.empty()) {
+            key.push_back(kEmpty);
+            return;
+        }
+        int part = itemShift_;
+        while (part + 3 <= std::min(shift, rootShift_)) {
+            part += 3;
+        }
+        const int64_t count = int64_t{1} << std::max(shift - part, 0);
+        if (count > 8) {
+            return;
+        }
+        for (int64_t i = 0; i < count * count * count; ++i) {
+            const Int3 at{{origin[0] + ((i / (count * count)) << part),
+                           origin[1] + ((i / count % count) << part),
+                           origin[2] + ((i % count) << part)}};
+            const Found found = find(at[0], at[1], at[2], part);
+            key.push_back(found.entry);
+            if (shift < itemShift_) {  // a part of an item: which one matters
+                const int64_t mask = (int64_t{1} << itemShift_) - 1;
+                key.push_back(static_cast<Entry>((at[0] & mask) << 16 | (at[1] & mask) << 8 |
+                                                 (at[2] & mask)));
+            }
+        }
+    }
+
+    /// The entry of a node with these children: the children's own where they are all one tile or
+    /// item, that of an equal node where there is one, else a new node's. For use while the table
+    /// is filled.
     Entry addNode(const Node& node) {
         const bool same =
             std::all_of(node.begin(), node.end(), [&](Entry e) { return e == node[0]; });
         if (same && (node[0] & kNodeFlag) == 0) {
             return node[0];
         }
+        const uint64_t hash = hashWords(node.data(), node.size() / 2, 0);
+        const auto [begin, end] = known_.equal_range(hash);
+        for (auto it = begin; it != end; ++it) {
+            if (nodes_[it->second & ~kNodeFlag] == node) {
+                return it->second;
+            }
+        }
         nodes_.push_back(node);
-        return static_cast<Entry>(nodes_.size() - 1) | kNodeFlag;
+        const Entry entry = static_cast<Entry>(nodes_.size() - 1) | kNodeFlag;
+        known_.emplace(hash, entry);
+        return entry;
     }
 
     /// The same table with every item and tile entry replaced by `map(entry)`, nodes that became
     /// uniform collapsed, and the nodes of one region next to each other in memory.
     template <class Map>
     SparseTable mapped(Map&& map) const {
-        SparseTable result = *this;
-        result.nodes_.clear();
+        SparseTable result;
+        result.itemShift_ = itemShift_;
+        result.rootShift_ = rootShift_;
+        result.rootLo_ = rootLo_;
+        result.rootSize_ = rootSize_;
         std::unordered_map<Entry, Entry> done;
-        for (Entry& e : result.root_) {
-            e = mapEntry(e, map, done, result);
+        for (const Entry entry : root_) {
+            result.root_.push_back(mapEntry(entry, map, done, result));
         }
         result.nodes_.shrink_to_fit();
+        result.known_.clear();
         return result;
     }
 
-    Found find(int64_t x, int64_t y, int64_t z) const {
+    /// The entry at a point: an item, a tile, or, with `minShift`, the node of at least that size.
+    Found find(int64_t x, int64_t y, int64_t z, int minShift = 0) const {
         const uint64_t rx = static_cast<uint64_t>((x >> rootShift_) - rootLo_[0]);
         const uint64_t ry = static_cast<uint64_t>((y >> rootShift_) - rootLo_[1]);
         const uint64_t rz = static_cast<uint64_t>((z >> rootShift_) - rootLo_[2]);
@@ -118,7 +175,7 @@ class SparseTable {
         }
         Entry entry = root_[(rx * ny + ry) * nz + rz];
         int shift = rootShift_;
-        while (entry & kNodeFlag) {
+        while ((entry & kNodeFlag) && shift > minShift) {
             shift -= 3;
             entry = nodes_[entry & ~kNodeFlag][childIndex(x >> shift, y >> shift, z >> shift)];
         }
@@ -198,6 +255,15 @@ class SparseTable {
         return box;
     }
 
+    /// How many items are occupied, tiles counted as the items they stand for.
+    uint64_t occupiedItems() const {
+        uint64_t count = 0;
+        forEach([&](const Int3&, int shift, Entry) {
+            count += uint64_t{1} << 3 * (shift - itemShift_);
+        });
+        return count;
+    }
+
     /// The one entry that stands for everywhere in the region of 2^shift voxels at `origin`, if
     /// any. Items that fill the region count too.
     std::optional<Entry> uniformEntry(const Int3& origin, int shift) const {
@@ -227,6 +293,13 @@ class SparseTable {
     }
 
   private:
+    struct KeyHash {
+        size_t operator()(const Key& key) const {
+            return hashWords(key.data(), key.size() / 2, key.size() % 2 ? key.back() : 0);
+        }
+    };
+    using Memo = std::unordered_map<Key, Entry, KeyHash>;
+
     static int64_t clampCell(double x, int64_t lo, int64_t hi) {
         // Points here are never negative but for rounding, so truncation is as good as floor.
         return std::min(std::max(static_cast<int64_t>(x), lo), hi - 1);
@@ -245,19 +318,35 @@ class SparseTable {
         }
     }
 
-    template <class Uniform, class Item>
-    Entry build(const Int3& origin, int shift, Uniform& uniform, Item& item) {
+    template <class Uniform, class Item, class KeyOf>
+    Entry build(const Int3& origin, int shift, Uniform& uniform, Item& item, KeyOf& keyOf,
+                Memo& memo) {
         if (const std::optional<Entry> entry = uniform(origin, shift)) {
             return *entry;
         }
+        Key key;
+        keyOf(origin, shift, key);
+        if (!key.empty()) {
+            key.push_back(static_cast<Entry>(shift));
+            if (const auto it = memo.find(key); it != memo.end()) {
+                return it->second;
+            }
+        }
+        Entry entry = kEmpty;
         if (shift == itemShift_) {
-            return item(origin);
+            entry = item(origin);
+        } else {
+            Node node;
+            for (size_t c = 0; c < node.size(); ++c) {
+                node[c] =
+                    build(childOrigin(origin, shift - 3, c), shift - 3, uniform, item, keyOf, memo);
+            }
+            entry = addNode(node);
         }
-        Node node;
-        for (size_t c = 0; c < node.size(); ++c) {
-            node[c] = build(childOrigin(origin, shift - 3, c), shift - 3, uniform, item);
+        if (!key.empty()) {
+            memo.emplace(std::move(key), entry);
         }
-        return addNode(node);
+        return entry;
     }
 
     template <class Map>
@@ -300,6 +389,7 @@ class SparseTable {
     Int3 rootSize_{{0, 0, 0}};
     std::vector<Entry> root_;
     std::vector<Node> nodes_;
+    std::unordered_multimap<uint64_t, Entry> known_;  // nodes by hash, while filling
 };
 
 }  // namespace trk

@@ -56,21 +56,21 @@ SuperVoxels::SuperVoxels(BakedVolume baked, float scale, TrkChoice choice, doubl
         v.bound = item.min == item.max ? 0.0f : roundUp(std::max(control - min, max - control));
         items_.push_back(v);
     }
-    for (PreviewLevel& level : levels_) {
-        for (float& mean : level.mean) {
-            mean *= scale;
+    for (ScalarTable& level : levels_) {
+        for (float& value : level.values) {
+            value *= scale;
         }
     }
     boxes_.assign(1, table_.occupiedBox());
-    for (const PreviewLevel& level : levels_) {
+    for (const ScalarTable& level : levels_) {
         boxes_.push_back(level.table.occupiedBox());
     }
 }
 
 size_t SuperVoxels::bytes() const {
     size_t sum = table_.bytes() + items_.capacity() * sizeof(SuperVoxel);
-    for (const PreviewLevel& level : levels_) {
-        sum += level.table.bytes() + level.mean.capacity() * sizeof(float);
+    for (const ScalarTable& level : levels_) {
+        sum += level.table.bytes() + level.values.capacity() * sizeof(float);
     }
     return sum;
 }
@@ -82,7 +82,7 @@ double SuperVoxels::integrateControl(const LocalRay& ray, size_t level, uint64_t
                [&](SparseTable::Entry entry, const Int3&, int, double tEnter, double tExit) {
                    ++regions;
                    const float mean =
-                       level == 0 ? items_[entry - 1].mean : levels_[level - 1].mean[entry - 1];
+                       level == 0 ? items_[entry - 1].mean : levels_[level - 1].values[entry - 1];
                    sum += static_cast<double>(mean) * (tExit - tEnter);
                    return true;
                });

@@ -22,10 +22,10 @@ struct BakedSuperVoxel {
     float rms = 0;       ///< upper bound of the residual's root mean square
 };
 
-/// Means of super-voxels larger than the baked ones, in density units: one preview level.
-struct PreviewLevel {
-    SparseTable table;  ///< entry: index into `mean`, plus one
-    std::vector<float> mean;
+/// One number per super-voxel.
+struct ScalarTable {
+    SparseTable table;  ///< entry: index into `values`, plus one
+    std::vector<float> values;
 };
 
 /// A whole bake. `table` maps local space to indices into `items`, plus one.
@@ -33,7 +33,7 @@ struct BakedVolume {
     int superVoxelShift = 4;  ///< log2 of the size
     SparseTable table;
     std::vector<BakedSuperVoxel> items;
-    std::vector<PreviewLevel> levels;  ///< levels 1, 2, …
+    std::vector<ScalarTable> levels;  ///< means of super-voxels 2, 4, … times as large
 
     int superVoxelSize() const { return 1 << superVoxelShift; }
 };
@@ -55,7 +55,7 @@ class SuperVoxels {
     SuperVoxels(BakedVolume baked, float scale, TrkChoice choice, double diagonal);
 
     int size() const { return 1 << table_.itemShift(); }
-    size_t count() const { return items_.size(); }
+    uint64_t count() const { return table_.occupiedItems(); }
     size_t levelCount() const { return levels_.size(); }
     /// Box of the occupied super-voxels of a level, in cells.
     const IntBox& box(size_t level = 0) const { return boxes_[level]; }
@@ -82,7 +82,7 @@ class SuperVoxels {
   private:
     SparseTable table_;
     std::vector<SuperVoxel> items_;
-    std::vector<PreviewLevel> levels_;     // in extinction
+    std::vector<ScalarTable> levels_;      // in extinction
     std::vector<IntBox> boxes_{IntBox{}};  // one a level, from 0
 };
 

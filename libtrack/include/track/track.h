@@ -187,10 +187,10 @@ typedef struct TrkVolumeInfo {
     double indexToWorld[12];  /**< world = first nine (rows) x index + last three */
     uint64_t activeVoxels;    /**< of the source grid; 0 where only a sidecar is open */
     uint64_t bytes;           /**< held by the volume */
+    uint64_t superVoxelCount; /**< occupied ones; 0 where there is no sidecar */
     uint32_t channels;        /**< floats per ray that estimates write: 1 */
     uint32_t hasDensity;      /**< 1 where exact, residual and ratio have what they look up */
     uint32_t superVoxelSize;  /**< in voxels; 0 where there is no sidecar */
-    uint32_t superVoxelCount; /**< occupied ones; 0 where there is no sidecar */
     uint32_t levels;          /**< preview levels above 0 */
     const char* gridName;     /**< of the source grid */
     const char* controlKind;  /**< "constant", or "" where there is no sidecar */

@@ -2,6 +2,7 @@
 #include "sidecar.h"
 
 #include "../error.h"
+#include "../hash.h"
 #include "tree_regions.h"
 #include "vdb_file.h"
 
@@ -10,11 +11,16 @@
 #include <openvdb/io/io.h>
 #include <openvdb/tools/Prune.h>
 
+#include <algorithm>
+#include <array>
 #include <cmath>
 #include <cstdio>
+#include <cstdlib>
+#include <cstring>
 #include <filesystem>
 #include <fstream>
 #include <functional>
+#include <unordered_map>
 #include <utility>
 #include <vector>
 
@@ -336,6 +342,7 @@ class SidecarReader {
   public:
     using GridType = openvdb::Grid<TreeType>;
     using Regions = TreeRegions<TreeType>;
+    using Entries = std::array<SparseTable::Entry, 6>;  // one a statistic; an even number, to hash
 
     SidecarReader(VdbFile& file, const SidecarHeader& header, TrkCheck check)
         : file_(file), header_(header), check_(check) {}
@@ -349,68 +356,94 @@ class SidecarReader {
         BakedVolume& baked = sidecar.baked;
         baked.superVoxelShift = shift;
 
-        // Where the RMS is 0 all over a region, the field is one constant there, so the region is
-        // one item; this grid therefore decides which regions are told apart.
-        std::vector<Int3> corners;
-        uint64_t activeVoxels = 0;
-        {
-            const auto grid = readGrid(prefix + "_rms", shift);
-            activeVoxels = grid->activeVoxelCount();
-            sidecar.anchor = anchor ? *anchor : anchorFor(supportBox(grid->tree(), shift));
-            baked.table = makeTable(grid->tree(), shift, sidecar.anchor, /*onlyZero=*/true,
-                                    [&](const Int3& at, int size, float value) {
-                                        BakedSuperVoxel item;
-                                        item.rms = value;
-                                        baked.items.push_back(item);
-                                        corners.push_back(at);
-                                        tileShifts_.push_back(size);
-                                        return baked.items.size();
-                                    });
-        }
+        // Grids are read one by one and kept as tables, which share what repeats.
+        std::vector<ScalarTable> tables;
         for (const Statistic& statistic : kStatistics) {
-            if (statistic.value == &BakedSuperVoxel::rms) {
-                continue;
-            }
             const auto grid = readGrid(prefix + statistic.suffix, shift);
-            if (grid->activeVoxelCount() != activeVoxels) {
-                badSidecar(file_.path(), "grid " + grid->getName() + " has " +
-                                             std::to_string(grid->activeVoxelCount()) +
-                                             " active super-voxels, " + prefix + "_rms " +
-                                             std::to_string(activeVoxels));
+            if (tables.empty()) {
+                box_ = supportBox(grid->tree(), shift);
+                sidecar.anchor = anchor ? *anchor : anchorFor(box_);
             }
-            Regions regions(grid->tree());
-            for (size_t i = 0; i < corners.size(); ++i) {
-                const auto region = regions.uniform(corners[i], tileShifts_[i]);
-                if (!region || !region->active) {
-                    badSidecar(file_.path(), "grids " + grid->getName() + " and " + prefix +
-                                                 "_rms disagree at " + where(corners[i]));
-                }
-                baked.items[i].*statistic.value = static_cast<float>(region->value);
-            }
+            tables.push_back(makeTable(*grid, shift, sidecar.anchor));
         }
-        if (check_ == TRK_CHECK_FULL) {
-            for (size_t i = 0; i < corners.size(); ++i) {
-                checkItem(baked.items[i], corners[i]);
-            }
-        }
+        join(tables, sidecar);
+        tables.clear();
         for (int level = 1; level <= header_.levels; ++level) {
             const auto grid = readGrid(prefix + levelSuffix(level), shift + level);
-            PreviewLevel preview;
-            preview.table = makeTable(
-                grid->tree(), shift + level, sidecar.anchor,
-                /*onlyZero=*/false, [&](const Int3& at, int, float value) {
-                    if (!(value >= 0) || !std::isfinite(value)) {
-                        badSidecar(file_.path(), "grid " + grid->getName() + " holds " +
-                                                     std::to_string(value) + " at " + where(at));
-                    }
-                    preview.mean.push_back(value);
-                    return preview.mean.size();
-                });
-            baked.levels.push_back(std::move(preview));
+            baked.levels.push_back(makeTable(*grid, shift + level, sidecar.anchor));
         }
     }
 
   private:
+    /// Makes super-voxels of the tables of their statistics; equal super-voxels are one item.
+    void join(const std::vector<ScalarTable>& tables, Sidecar& sidecar) const {
+        struct Hash {
+            size_t operator()(const Entries& entries) const {
+                return hashWords(entries.data(), entries.size() / 2, 0);
+            }
+        };
+        BakedVolume& baked = sidecar.baked;
+        std::unordered_map<Entries, SparseTable::Entry, Hash> known;
+        baked.table = SparseTable(baked.superVoxelShift, toLocal(box_, sidecar.anchor));
+        const auto itemOf = [&](const Entries& entries, const Int3& local) {
+            const auto [it, isNew] =
+                known.try_emplace(entries, static_cast<SparseTable::Entry>(known.size() + 1));
+            if (isNew) {
+                BakedSuperVoxel item;
+                for (size_t i = 0; i < tables.size(); ++i) {
+                    item.*kStatistics[i].value = tables[i].values[entries[i] - 1];
+                }
+                if (check_ == TRK_CHECK_FULL) {
+                    checkItem(item, superVoxel(local, baked.superVoxelShift, sidecar.anchor));
+                }
+                baked.items.push_back(item);
+            }
+            return it->second;
+        };
+        baked.table.fill(
+            [&](const Int3& local, int shift) -> std::optional<SparseTable::Entry> {
+                Entries entries{};
+                size_t empty = 0;
+                for (size_t i = 0; i < tables.size(); ++i) {
+                    const auto entry = tables[i].table.uniformEntry(local, shift);
+                    if (!entry) {
+                        return std::nullopt;
+                    }
+                    entries[i] = *entry;
+                    empty += *entry == SparseTable::kEmpty ? 1 : 0;
+                }
+                if (empty == tables.size()) {
+                    return SparseTable::kEmpty;
+                }
+                if (empty > 0) {
+                    badSidecar(file_.path(),
+                               "its grids are not active in the same super-voxels: see " +
+                                   where(superVoxel(local, baked.superVoxelShift, sidecar.anchor)));
+                }
+                return itemOf(entries, local);
+            },
+            [](const Int3&) { return SparseTable::kEmpty; },  // a super-voxel is always uniform
+            [&](const Int3& local, int shift, SparseTable::Key& key) {
+                for (const ScalarTable& table : tables) {
+                    table.table.appendKey(local, shift, key);
+                }
+            });
+    }
+
+    /// Index of the super-voxel at a place of local space.
+    static Int3 superVoxel(const Int3& local, int shift, const Int3& anchor) {
+        return {{(anchor[0] + local[0]) >> shift, (anchor[1] + local[1]) >> shift,
+                 (anchor[2] + local[2]) >> shift}};
+    }
+
+    static IntBox toLocal(IntBox box, const Int3& anchor) {
+        for (size_t a = 0; a < 3 && !box.empty(); ++a) {
+            box.lo[a] -= anchor[a];
+            box.hi[a] -= anchor[a];
+        }
+        return box;
+    }
+
     static std::string where(const Int3& at) {
         return "super-voxel (" + std::to_string(at[0]) + ", " + std::to_string(at[1]) + ", " +
                std::to_string(at[2]) + ")";
@@ -453,29 +486,16 @@ class SidecarReader {
         return box;
     }
 
-    /// Builds a table with one item per active value, or per region of one value (with `onlyZero`,
-    /// of value 0). `add(super-voxel index, log2 of the region's edge, value)` answers the item's
-    /// number, from 1.
-    template <class Add>
-    static SparseTable makeTable(const TreeType& tree, int shift, const Int3& anchor, bool onlyZero,
-                                 const Add& add) {
-        IntBox box = supportBox(tree, shift);
-        if (box.empty()) {
-            return {};
-        }
-        for (size_t a = 0; a < 3; ++a) {
-            box.lo[a] -= anchor[a];
-            box.hi[a] -= anchor[a];
-        }
-        SparseTable table(shift, box);
-        Regions regions(tree);
-        const auto index = [&](const Int3& local) {
-            return Int3{{(anchor[0] + local[0]) >> shift, (anchor[1] + local[1]) >> shift,
-                         (anchor[2] + local[2]) >> shift}};
-        };
-        table.fill(
+    /// The active values of a grid, as a table over local space.
+    ScalarTable makeTable(const GridType& grid, int shift, const Int3& anchor) const {
+        ScalarTable result;
+        std::unordered_map<float, SparseTable::Entry> known;
+        SparseTable::Entry last = SparseTable::kEmpty;
+        result.table = SparseTable(shift, toLocal(supportBox(grid.tree(), shift), anchor));
+        Regions regions(grid.tree());
+        result.table.fill(
             [&](const Int3& local, int regionShift) -> std::optional<SparseTable::Entry> {
-                const Int3 at = index(local);
+                const Int3 at = superVoxel(local, shift, anchor);
                 const auto region = regions.uniform(at, regionShift - shift);
                 if (!region) {
                     return std::nullopt;
@@ -483,14 +503,23 @@ class SidecarReader {
                 if (!region->active) {
                     return SparseTable::kEmpty;
                 }
-                if (regionShift > shift && onlyZero && !(region->value == 0)) {
-                    return std::nullopt;
+                const auto value = static_cast<float>(region->value);
+                if (!(value >= 0) || !std::isfinite(value)) {
+                    badSidecar(file_.path(), "grid " + grid.getName() + ": " + where(at) +
+                                                 " is negative, NaN or infinite");
                 }
-                return static_cast<SparseTable::Entry>(
-                    add(at, regionShift - shift, static_cast<float>(region->value)));
+                if (last == SparseTable::kEmpty || value != result.values[last - 1]) {
+                    const auto [it, isNew] = known.try_emplace(
+                        value, static_cast<SparseTable::Entry>(result.values.size() + 1));
+                    if (isNew) {
+                        result.values.push_back(value);
+                    }
+                    last = it->second;
+                }
+                return last;
             },
-            [&](const Int3&) { return SparseTable::kEmpty; });
-        return table;
+            [](const Int3&) { return SparseTable::kEmpty; });  // a super-voxel is always uniform
+        return result;
     }
 
     void checkItem(const BakedSuperVoxel& v, const Int3& at) const {
@@ -499,13 +528,7 @@ class SidecarReader {
         const double needed =
             std::max(control - static_cast<double>(v.min), static_cast<double>(v.max) - control);
         const char* wrong = nullptr;
-        for (const Statistic& statistic : kStatistics) {
-            if (!(v.*statistic.value >= 0) || !std::isfinite(v.*statistic.value)) {
-                wrong = "a value that is negative, NaN or infinite";
-            }
-        }
-        if (wrong) {
-        } else if (v.rms > 0 && v.majorant == 0) {
+        if (v.rms > 0 && v.majorant == 0) {
             wrong = "majorant 0 with an RMS above 0";
         } else if (v.min > v.max || v.control * slack < static_cast<double>(v.min) ||
                    control > static_cast<double>(v.max) * slack) {
@@ -527,7 +550,7 @@ class SidecarReader {
     VdbFile& file_;
     const SidecarHeader& header_;
     TrkCheck check_;
-    std::vector<int> tileShifts_;
+    IntBox box_;  // index space
 };
 
 }  // namespace
@@ -574,9 +597,9 @@ void writeSidecar(const OutputFile& file, const SidecarHeader& header, const Bak
                                  [&](size_t i) { return baked.items[i].*statistic.value; }));
         }
         for (int32_t level = 1; level <= levels; ++level) {
-            const PreviewLevel& preview = baked.levels[static_cast<size_t>(level) - 1];
+            const ScalarTable& preview = baked.levels[static_cast<size_t>(level) - 1];
             archive.add(makeGrid(header, preview.table, anchor, levelSuffix(level),
-                                 [&](size_t i) { return preview.mean[i]; }));
+                                 [&](size_t i) { return preview.values[i]; }));
         }
         stream.close();
     } catch (const std::ios_base::failure&) {

@@ -50,9 +50,6 @@ class TreeRegions {
     /// into different ones. A leaf counts as divided.
     std::optional<Region> uniform(const Int3& origin, int shift) {
         const Region nothing{tree_.background(), false};
-        if (!inRange(origin)) {
-            return nothing;
-        }
         if (shift > kUpperShift) {  // may hold several of the root's regions: uniform only if empty
             const int64_t size = int64_t{1} << shift;
             for (const Int3& o : rootOrigins_) {
@@ -61,6 +58,9 @@ class TreeRegions {
                     return std::nullopt;
                 }
             }
+            return nothing;
+        }
+        if (!inRange(origin)) {  // all of it is, as the limits are multiples of 4096
             return nothing;
         }
         const openvdb::Coord at = coord(origin);

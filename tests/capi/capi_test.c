@@ -1,0 +1,67 @@
+/* SPDX-License-Identifier: Apache-2.0 */
+/* Calls every exported function from C99. Argument 1: a density with a sidecar beside it. */
+#include "track/track.h"
+
+#include <math.h>
+#include <stdio.h>
+#include <string.h>
+
+static int failures = 0;
+
+static void expect(int condition, const char* what) {
+    if (!condition) {
+        fprintf(stderr, "capi_test: failed: %s (last error: %s)\n", what, trkGetLastErrorMessage());
+        ++failures;
+    }
+}
+
+int main(int argc, char** argv) {
+    TrkVolumeOptions options = trkDefaultVolumeOptions();
+    TrkQuery query = trkDefaultQuery();
+    TrkVolume* volume = NULL;
+    TrkVolumeInfo info;
+    TrkRay ray = {{0.0f, 0.0f, 0.0f}, 0.0f, {1.0f, 0.0f, 0.0f}, INFINITY};
+    TrkStatistics statistics;
+    float transmittance = -1.0f;
+    double depth = -1.0;
+    int a;
+
+    if (argc != 2) {
+        fprintf(stderr, "usage: capi_test DENSITY.vdb\n");
+        return 2;
+    }
+    expect(strlen(trkGetVersion()) >= 5, "trkGetVersion");
+    expect(strcmp(trkGetStatusName(TRK_OK), "TRK_OK") == 0, "trkGetStatusName(TRK_OK)");
+    expect(strcmp(trkGetStatusName(TRK_ERROR_NO_SIDECAR), "TRK_ERROR_NO_SIDECAR") == 0,
+           "trkGetStatusName(TRK_ERROR_NO_SIDECAR)");
+
+    options.choice = TRK_CHOICE_MEAN;
+    expect(trkOpenVolume(argv[1], NULL, &options, &volume) == TRK_OK, "trkOpenVolume");
+    if (!volume) {
+        return 1;
+    }
+    info.size = sizeof(info);
+    expect(trkGetVolumeInfo(volume, &info) == TRK_OK, "trkGetVolumeInfo");
+    expect(info.hasDensity == 1 && info.superVoxelSize > 0 && info.channels == 1, "info");
+
+    for (a = 0; a < 3; ++a) {
+        ray.origin[a] = (float)(0.5 * (info.boundsMin[a] + info.boundsMax[a]));
+    }
+    ray.tMin = -INFINITY;
+    query.samples = 64;
+    expect(trkEstimateTransmittance(volume, &query, &ray, 1, &transmittance, &statistics) == TRK_OK,
+           "trkEstimateTransmittance");
+    query.method = TRK_METHOD_EXACT;
+    expect(trkIntegrateOpticalDepth(volume, &query, &ray, 1, &depth) == TRK_OK,
+           "trkIntegrateOpticalDepth");
+    expect(
+        depth > 0.0 && fabs(exp(-depth) - transmittance) < 6 * statistics.standardError[0] + 1e-6,
+        "the estimate is near the exact value");
+    trkCloseVolume(volume);
+    trkCloseVolume(NULL);
+
+    expect(trkOpenVolume("/no/such/file.vdb", NULL, NULL, &volume) == TRK_ERROR_IO, "missing file");
+    expect(volume == NULL, "no volume after a failure");
+    expect(strstr(trkGetLastErrorMessage(), "/no/such/file.vdb") != NULL, "trkGetLastErrorMessage");
+    return failures == 0 ? 0 : 1;
+}

@@ -1,0 +1,114 @@
+// SPDX-License-Identifier: Apache-2.0
+#include "fixtures.h"
+
+#include "bake.h"
+#include "procedural.h"
+
+#include <unistd.h>
+
+#include <cmath>
+#include <cstdlib>
+#include <filesystem>
+
+namespace fixtures {
+namespace {
+
+struct TemporaryFolder {
+    std::filesystem::path path;
+
+    TemporaryFolder()
+        : path(std::filesystem::temp_directory_path() /
+               ("track-test-" + std::to_string(getpid()))) {
+        std::filesystem::create_directories(path);
+    }
+    ~TemporaryFolder() {
+        std::error_code ignored;
+        std::filesystem::remove_all(path, ignored);
+    }
+};
+
+}  // namespace
+
+std::string path(const std::string& name) {
+    static const TemporaryFolder folder;
+    return (folder.path / name).string();
+}
+
+std::string dataFolder() {
+    const char* folder = std::getenv("TRACK_TEST_DATA");
+    return folder && std::filesystem::is_directory(folder) ? folder : "";
+}
+
+openvdb::FloatGrid::Ptr makeGrid(const openvdb::CoordBBox& box,
+                                 const std::function<float(const openvdb::Coord&)>& f) {
+    openvdb::initialize();
+    auto grid = openvdb::FloatGrid::create();
+    auto accessor = grid->getAccessor();
+    for (auto at = box.begin(); at; ++at) {
+        const float v = f(*at);
+        if (v != 0) {
+            accessor.setValue(*at, v);
+        }
+    }
+    grid->setName("density");
+    grid->setGridClass(openvdb::GRID_FOG_VOLUME);
+    return grid;
+}
+
+openvdb::FloatGrid::Ptr makeBlob(int n) {
+    const double centre = 0.5 * (n - 1);
+    return makeGrid(openvdb::CoordBBox(0, 0, 0, n - 1, n - 1, n - 1), [&](const openvdb::Coord& p) {
+        const double x = (p.x() - centre) / n;
+        const double y = (p.y() - centre) / n;
+        const double z = (p.z() - centre) / n;
+        const double r2 = x * x + y * y + z * z;
+        const double texture =
+            1 + 0.5 * std::sin(1.3 * p.x()) * std::sin(1.1 * p.y() + 0.7 * p.z());
+        return r2 > 0.24 ? 0.0f : static_cast<float>(std::exp(-12 * r2) * texture);
+    });
+}
+
+std::string write(const std::string& name, const openvdb::GridCPtrVec& grids) {
+    openvdb::initialize();
+    openvdb::io::File file(path(name));
+    file.write(grids);
+    return path(name);
+}
+
+std::string cloudFile(int n) {
+    const std::string name = path("cloud" + std::to_string(n) + ".vdb");
+    if (!std::filesystem::exists(name)) {
+        vdbtools::ProceduralOptions options;
+        options.voxels = n;
+        trk::OutputFile file(name, false);
+        vdbtools::writeProcedural(options, file, [](double) {});
+        file.commit();
+    }
+    return name;
+}
+
+trk::Density load(const std::string& file, const std::string& grid) {
+    trk::DensityOptions options;
+    options.gridNamed = !grid.empty();
+    options.gridName = grid;
+    return trk::loadDensity(file, options);
+}
+
+void bake(const std::string& vdb, const std::string& sidecar, int size, int levels) {
+    const trk::Density density = load(vdb);
+    trk::SidecarHeader header;
+    header.toolVersion = "test";
+    header.sourceFile = "test.vdb";
+    header.source = density.summary.grid;
+    header.valueType = density.summary.valueType;
+    header.digest = density.summary.digest;
+    header.indexToWorld = density.summary.indexToWorld;
+    header.superVoxelSize = size;
+    header.levels = levels;
+    trk::OutputFile file(sidecar, true);
+    trk::writeSidecar(file, header, vdbtools::bake(density.field, size, levels),
+                      density.summary.anchor);
+    file.commit();
+}
+
+}  // namespace fixtures

@@ -1,0 +1,46 @@
+// SPDX-License-Identifier: Apache-2.0
+// Volumes the tests make, and where they put them.
+#pragma once
+
+#include "io/density.h"
+#include "io/sidecar.h"
+
+#include <openvdb/openvdb.h>
+
+#include <cstdint>
+#include <functional>
+#include <string>
+
+namespace fixtures {
+
+/// A file name in this process's own temporary folder, which is removed at exit.
+std::string path(const std::string& name);
+
+/// The folder of real volumes, or "" where there is none (environment variable TRACK_TEST_DATA).
+std::string dataFolder();
+
+/// Skips the current test, visibly, without the real volumes.
+#define TRACK_NEEDS_DATA()                                                 \
+    if (fixtures::dataFolder().empty()) {                                  \
+        GTEST_SKIP() << "TRACK_TEST_DATA names no folder of real volumes"; \
+    }
+
+/// A fog volume named "density" with the values of `f` (0 is inactive) over a box of index space.
+openvdb::FloatGrid::Ptr makeGrid(const openvdb::CoordBBox& box,
+                                 const std::function<float(const openvdb::Coord&)>& f);
+
+/// A Gaussian blob with some texture on it, at the centre of an n^3 box.
+openvdb::FloatGrid::Ptr makeBlob(int n);
+
+/// Writes grids to path(name) and answers that path.
+std::string write(const std::string& name, const openvdb::GridCPtrVec& grids);
+
+/// The procedural cloud of n^3 voxels, made once per process.
+std::string cloudFile(int n);
+
+trk::Density load(const std::string& path, const std::string& grid = "");
+
+/// Bakes `vdb` to `sidecar` the way `vdbtrack bake` does.
+void bake(const std::string& vdb, const std::string& sidecar, int size, int levels = 2);
+
+}  // namespace fixtures

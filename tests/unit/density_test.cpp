@@ -1,0 +1,282 @@
+// SPDX-License-Identifier: Apache-2.0
+// Loading: which grid, which refusals, which values.
+#include "support/fixtures.h"
+
+#include "error.h"
+#include "io/vdb_file.h"
+
+#include <gtest/gtest.h>
+#include <openvdb/io/Stream.h>
+
+#include <filesystem>
+#include <fstream>
+#include <limits>
+
+namespace {
+
+using openvdb::Coord;
+using openvdb::CoordBBox;
+
+/// Status and message of the Error that loading throws; TRK_OK where it throws none.
+std::pair<TrkStatus, std::string> failure(const std::string& path,
+                                          const trk::DensityOptions& options) {
+    try {
+        trk::loadDensity(path, options);
+        return {TRK_OK, ""};
+    } catch (const trk::Error& e) {
+        return {e.status(), e.what()};
+    }
+}
+
+void expectFailure(const std::string& path, TrkStatus status, const std::string& text,
+                   const std::string& grid = "") {
+    trk::DensityOptions options;
+    options.gridNamed = !grid.empty();
+    options.gridName = grid;
+    const auto [found, message] = failure(path, options);
+    EXPECT_EQ(found, status) << message;
+    EXPECT_NE(message.find(text), std::string::npos) << message;
+    EXPECT_NE(message.find(path), std::string::npos) << message;
+    EXPECT_EQ(message.find('\n'), std::string::npos) << message;
+}
+
+openvdb::FloatGrid::Ptr single(float value, const char* name = "density") {
+    auto grid =
+        fixtures::makeGrid(CoordBBox(0, 0, 0, 0, 0, 0), [&](const Coord&) { return value; });
+    grid->setName(name);
+    return grid;
+}
+
+float densityAt(const trk::Density& density, double x, double y, double z) {
+    const auto& anchor = density.summary.anchor;
+    return density.field.density(
+        {{x - static_cast<double>(anchor[0]), y - static_cast<double>(anchor[1]),
+          z - static_cast<double>(anchor[2])}});
+}
+
+TEST(LoadDensity, ChoosesTheOnlyCandidate) {
+    auto fog = single(1, "smoke");
+    auto levelSet = single(1, "surface");
+    levelSet->setGridClass(openvdb::GRID_LEVEL_SET);
+    auto mask = openvdb::BoolGrid::create();
+    mask->setName("mask");
+    const std::string path = fixtures::write("choose.vdb", {levelSet, mask, fog});
+    EXPECT_EQ(fixtures::load(path).summary.grid.name, "smoke");
+}
+
+TEST(LoadDensity, PrefersDensityAmongSeveral) {
+    const std::string path = fixtures::write("several.vdb", {single(1, "heat"), single(2)});
+    EXPECT_EQ(fixtures::load(path).summary.grid.name, "density");
+    EXPECT_EQ(fixtures::load(path, "heat").summary.max, 1.0f);
+    const std::string other = fixtures::write("others.vdb", {single(1, "a"), single(2, "b")});
+    expectFailure(other, TRK_ERROR_GRID_NOT_FOUND, "a, b");
+    expectFailure(other, TRK_ERROR_GRID_NOT_FOUND, "no grid \"c\"", "c");
+}
+
+TEST(LoadDensity, TellsEqualNamesApartByIndex) {
+    const std::string path = fixtures::write("equal.vdb", {single(1), single(2), single(3)});
+    expectFailure(path, TRK_ERROR_GRID_NOT_FOUND, "density[0], density[1], density[2]");
+    expectFailure(path, TRK_ERROR_GRID_NOT_FOUND, "3 grids named", "density");
+    for (int i = 0; i < 3; ++i) {
+        const trk::Density d = fixtures::load(path, "density[" + std::to_string(i) + "]");
+        EXPECT_EQ(d.summary.grid.index, i);
+        EXPECT_EQ(d.summary.max, static_cast<float>(i + 1));
+    }
+}
+
+TEST(LoadDensity, OpensAnUnnamedGrid) {
+    const std::string path = fixtures::write("unnamed.vdb", {single(4, "")});
+    EXPECT_EQ(fixtures::load(path).summary.max, 4.0f);
+    EXPECT_EQ(fixtures::load(path, "[0]").summary.max, 4.0f);
+}
+
+TEST(LoadDensity, SharedTreesAreFollowed) {
+    auto first = single(5, "first");
+    openvdb::FloatGrid::Ptr second = first->copy();  // shares the tree: an instance in the file
+    second->setName("second");
+    const std::string path = fixtures::write("instance.vdb", {first, second});
+    EXPECT_EQ(fixtures::load(path, "second").summary.max, 5.0f);
+}
+
+TEST(LoadDensity, ReadsFilesWithoutOffsets) {
+    std::ofstream stream(fixtures::path("stream.vdb"), std::ios::binary);
+    openvdb::io::Stream(stream).write(openvdb::GridCPtrVec{single(1, "heat"), single(6)});
+    stream.close();
+    EXPECT_EQ(fixtures::load(fixtures::path("stream.vdb")).summary.max, 6.0f);
+}
+
+TEST(LoadDensity, RefusesWhatIsNoFogVolume) {
+    auto levelSet = single(1);
+    levelSet->setGridClass(openvdb::GRID_LEVEL_SET);
+    expectFailure(fixtures::write("ls.vdb", {levelSet}), TRK_ERROR_UNSUPPORTED_GRID, "level set");
+    auto staggered = openvdb::Vec3SGrid::create();
+    staggered->setName("v");
+    staggered->setGridClass(openvdb::GRID_STAGGERED);
+    expectFailure(fixtures::write("staggered.vdb", {staggered}), TRK_ERROR_UNSUPPORTED_GRID,
+                  "vec3s");
+    auto ints = openvdb::Int32Grid::create();
+    ints->setName("ids");
+    expectFailure(fixtures::write("ints.vdb", {ints}), TRK_ERROR_UNSUPPORTED_GRID, "int32");
+    auto frustum = single(1);
+    frustum->setTransform(openvdb::math::Transform::createFrustumTransform(
+        openvdb::BBoxd(openvdb::Vec3d(0), openvdb::Vec3d(10)), 0.5, 10, 1));
+    expectFailure(fixtures::write("frustum.vdb", {frustum}), TRK_ERROR_UNSUPPORTED_GRID, "frustum");
+    expectFailure(fixtures::write("none.vdb", {}), TRK_ERROR_GRID_NOT_FOUND, "no grids");
+}
+
+TEST(LoadDensity, RefusesAnUnregisteredTypeButOpensItsNeighbour) {
+    using Tree = openvdb::tree::Tree3<float, 2, 2>::Type;
+    using OddGrid = openvdb::Grid<Tree>;
+    openvdb::initialize();
+    OddGrid::registerGrid();
+    auto odd = OddGrid::create();
+    odd->setName("odd");
+    const std::string path = fixtures::write("odd.vdb", {odd, single(7)});
+    OddGrid::unregisterGrid();
+    EXPECT_EQ(fixtures::load(path, "density").summary.max, 7.0f);
+    expectFailure(path, TRK_ERROR_UNSUPPORTED_GRID, "of type", "odd");
+}
+
+TEST(LoadDensity, RefusesBadValuesNamingCountAndFirstVoxel) {
+    const CoordBBox box(0, 0, 0, 20, 9, 9);
+    const auto withBad = [&](float bad) {
+        return fixtures::makeGrid(box, [&](const Coord& p) {
+            return p == Coord(3, 4, 5) || p == Coord(17, 0, 0) ? bad : 1.0f;
+        });
+    };
+    const std::string negative = fixtures::write("negative.vdb", {withBad(-0.5f)});
+    expectFailure(negative, TRK_ERROR_BAD_DENSITY,
+                  "2 voxels are negative, the first at index (3, 4, 5)");
+    for (const float bad :
+         {std::numeric_limits<float>::quiet_NaN(), std::numeric_limits<float>::infinity()}) {
+        expectFailure(fixtures::write("nan.vdb", {withBad(bad)}), TRK_ERROR_BAD_DENSITY,
+                      "2 voxels are NaN or infinite");
+    }
+    auto background = openvdb::FloatGrid::create(1.0f);
+    background->setName("density");
+    expectFailure(fixtures::write("background.vdb", {background}), TRK_ERROR_BAD_DENSITY,
+                  "background is 1");
+
+    trk::DensityOptions repair;
+    repair.repair = TRK_REPAIR_CLAMP_NEGATIVE;
+    const trk::Density clamped = trk::loadDensity(negative, repair);
+    EXPECT_EQ(clamped.summary.clamped, 2u);
+    EXPECT_EQ(densityAt(clamped, 3, 4, 5), 0.0f);
+    EXPECT_EQ(densityAt(clamped, 3, 4, 6), 1.0f);
+}
+
+TEST(LoadDensity, InactiveValuesAndTilesCount) {
+    auto grid = single(1);
+    grid->tree().setValueOff(Coord(1, 0, 0), 0.5f);
+    grid->tree().addTile(1, Coord(16, 0, 0), 2.0f, false);
+    const trk::Density d = fixtures::load(fixtures::write("inactive.vdb", {grid}));
+    EXPECT_EQ(densityAt(d, 1, 0, 0), 0.5f);
+    EXPECT_EQ(densityAt(d, 0.5, 0, 0), 0.75f);
+    EXPECT_EQ(densityAt(d, 20, 3, 3), 2.0f);
+    EXPECT_EQ(densityAt(d, 15.5, 3, 3), 1.0f);
+}
+
+TEST(LoadDensity, StoresHalfsOnlyWhereExact) {
+    auto grid = fixtures::makeBlob(24);
+    EXPECT_FALSE(fixtures::load(fixtures::write("float.vdb", {grid})).field.isHalf());
+    grid->setSaveFloatAsHalf(true);
+    const std::string path = fixtures::write("half.vdb", {grid});
+    const trk::Density d = fixtures::load(path);
+    EXPECT_TRUE(d.field.isHalf());
+    openvdb::io::File file(path);
+    file.open();
+    auto read = openvdb::gridPtrCast<openvdb::FloatGrid>(file.readGrid("density"));
+    for (auto it = read->cbeginValueOn(); it; ++it) {
+        const Coord p = it.getCoord();
+        ASSERT_EQ(densityAt(d, p.x(), p.y(), p.z()), *it);
+    }
+}
+
+TEST(LoadDensity, DoubleGridsAreReadAsFloats) {
+    openvdb::initialize();
+    auto grid = openvdb::DoubleGrid::create();
+    grid->setName("density");
+    grid->tree().setValue(Coord(2, 3, 4), 0.1);
+    const trk::Density d = fixtures::load(fixtures::write("double.vdb", {grid}));
+    EXPECT_EQ(d.summary.valueType, "double");
+    EXPECT_EQ(densityAt(d, 2, 3, 4), 0.1f);
+    grid->tree().setValue(Coord(2, 3, 4), 1e300);
+    expectFailure(fixtures::write("huge.vdb", {grid}), TRK_ERROR_BAD_DENSITY, "infinite");
+}
+
+TEST(LoadDensity, WorksAtTheLimitsOfIndices) {
+    constexpr int32_t kMax = std::numeric_limits<int32_t>::max();
+    constexpr int32_t kMin = std::numeric_limits<int32_t>::min();
+    auto grid = single(0);
+    grid->tree().setValue(Coord(kMax, kMax, kMax), 1.0f);
+    grid->tree().setValue(Coord(kMin, kMin, kMin), 2.0f);
+    const trk::Density d = fixtures::load(fixtures::write("limits.vdb", {grid}));
+    EXPECT_EQ(densityAt(d, kMax, kMax, kMax), 1.0f);
+    EXPECT_EQ(densityAt(d, kMax + 0.5, kMax, kMax), 0.5f);
+    EXPECT_EQ(densityAt(d, kMin, kMin, kMin), 2.0f);
+    EXPECT_EQ(densityAt(d, kMin - 0.5, kMin, kMin), 1.0f);
+    EXPECT_LT(d.field.bytes(), 2000000u);
+}
+
+TEST(LoadDensity, DigestSeesEveryChange) {
+    auto grid = fixtures::makeBlob(20);
+    const auto digest = [&](const char* name) {
+        return fixtures::load(fixtures::write(name, {grid})).summary.digest;
+    };
+    const uint64_t original = digest("digest.vdb");
+    EXPECT_EQ(digest("again.vdb"), original);
+    grid->tree().setActiveState(Coord(10, 10, 10), false);
+    const uint64_t masked = digest("masked.vdb");
+    EXPECT_NE(masked, original);
+    grid->tree().setActiveState(Coord(10, 10, 10), true);
+    grid->tree().setValue(Coord(10, 10, 10), 0.123f);
+    EXPECT_NE(digest("changed.vdb"), original);
+    grid->tree().addTile(1, Coord(1024, 0, 0), 1.0f, true);
+    const uint64_t tiled = digest("tiled.vdb");
+    grid->tree().addTile(1, Coord(1024, 0, 0), 1.0f, false);
+    EXPECT_NE(digest("inactive-tile.vdb"), tiled);
+}
+
+TEST(LoadDensity, RefusesForeignAndDamagedFiles) {
+    const auto writeBytes = [](const char* name, const std::string& bytes) {
+        std::ofstream(fixtures::path(name), std::ios::binary) << bytes;
+        return fixtures::path(name);
+    };
+    expectFailure(fixtures::path("missing.vdb"), TRK_ERROR_IO, "No such file");
+    expectFailure(std::filesystem::path(fixtures::path("x")).parent_path().string(), TRK_ERROR_IO,
+                  "directory");
+    expectFailure(writeBytes("empty.vdb", ""), TRK_ERROR_BAD_FILE, "empty");
+    expectFailure(writeBytes("text.vdb", "hello, I am a text file"), TRK_ERROR_BAD_FILE, "text");
+    expectFailure(writeBytes("nano.vdb", "NanoVDB2 and so on"), TRK_ERROR_BAD_FILE, "NanoVDB");
+
+    const std::string good = fixtures::write("good.vdb", {fixtures::makeBlob(40)});
+    std::ifstream stream(good, std::ios::binary);
+    const std::string bytes((std::istreambuf_iterator<char>(stream)),
+                            std::istreambuf_iterator<char>());
+    for (const size_t keep : {size_t{9}, size_t{30}, size_t{80}, size_t{150}, bytes.size() / 3,
+                              bytes.size() / 2, bytes.size() - 1}) {
+        expectFailure(writeBytes("short.vdb", bytes.substr(0, keep)), TRK_ERROR_BAD_FILE, "");
+    }
+    std::string newer = bytes;
+    newer[8] = static_cast<char>(0xff);
+    expectFailure(writeBytes("newer.vdb", newer), TRK_ERROR_BAD_FILE, "version");
+}
+
+TEST(LoadDensity, HonoursTheMemoryCap) {
+    trk::DensityOptions options;
+    options.maxMemory = 10000;
+    const auto [status, message] =
+        failure(fixtures::write("capped.vdb", {fixtures::makeBlob(40)}), options);
+    EXPECT_EQ(status, TRK_ERROR_OUT_OF_MEMORY);
+    EXPECT_NE(message.find("10000"), std::string::npos);
+}
+
+TEST(LoadDensity, EmptyGridsAreEmptyFields) {
+    auto grid = openvdb::FloatGrid::create();
+    grid->setName("density");
+    const trk::Density d = fixtures::load(fixtures::write("void.vdb", {grid}));
+    EXPECT_TRUE(d.field.box().empty());
+    EXPECT_EQ(densityAt(d, 0, 0, 0), 0.0f);
+}
+
+}  // namespace

@@ -1,0 +1,158 @@
+// SPDX-License-Identifier: Apache-2.0
+// The small pieces of arithmetic: scaled products, halfs, random numbers, the robust control, maps.
+#include "estimators/scaled_product.h"
+#include "extinction_field.h"
+#include "math.h"
+#include "rng.h"
+#include "super_voxels.h"
+
+#include <gtest/gtest.h>
+
+#include <cmath>
+#include <limits>
+
+namespace {
+
+TEST(ScaledProduct, SurvivesWeightsAndDepthsThatCancel) {
+    trk::ScaledProduct product;
+    for (int i = 0; i < 10000; ++i) {
+        product.multiply(2);
+    }
+    EXPECT_NEAR(product.timesExp(10000 * std::log(2.0)), 1, 1e-9);
+    for (int i = 0; i < 20000; ++i) {
+        product.multiply(0.5);
+    }
+    EXPECT_NEAR(product.timesExp(-10000 * std::log(2.0)), 1, 1e-9);
+}
+
+TEST(ScaledProduct, SaturatesInsteadOfOverflowing) {
+    trk::ScaledProduct product;
+    for (int i = 0; i < 100000; ++i) {
+        product.multiply(-1.999);
+    }
+    const double limit = static_cast<double>(std::numeric_limits<float>::max());
+    EXPECT_EQ(product.timesExp(0), limit);
+    product.multiply(-1);
+    EXPECT_EQ(product.timesExp(-1e300), -limit);
+    EXPECT_EQ(product.timesExp(std::numeric_limits<double>::infinity()), 0);
+    product.multiply(0);
+    EXPECT_TRUE(product.isZero());
+    EXPECT_EQ(product.timesExp(-1e300), 0);
+}
+
+TEST(Half, RoundTripsEveryFiniteValue) {
+    for (uint32_t bits = 0; bits < 0x7c00; ++bits) {
+        const float value = trk::decodeHalf(static_cast<uint16_t>(bits));
+        ASSERT_TRUE(trk::isExactHalf(value)) << bits;
+        ASSERT_EQ(trk::encodeHalf(value), bits);
+        // Halfway to the next one is no half.
+        if (bits > 0) {
+            const float between = 0.5f * (value + trk::decodeHalf(static_cast<uint16_t>(bits - 1)));
+            ASSERT_FALSE(trk::isExactHalf(between)) << bits;
+        }
+    }
+    EXPECT_EQ(trk::decodeHalf(0x3c00), 1.0f);
+    EXPECT_EQ(trk::decodeHalf(0x7bff), 65504.0f);
+    EXPECT_FALSE(trk::isExactHalf(65536.0f));
+    EXPECT_FALSE(trk::isExactHalf(1e-40f));
+}
+
+TEST(Rng, ExponentialHasMeanAndVarianceOne) {
+    trk::Rng rng(1, 2, 3, 4);
+    constexpr int kCount = 1000000;
+    double sum = 0;
+    double squares = 0;
+    for (int i = 0; i < kCount; ++i) {
+        const double x = rng.exponential();
+        ASSERT_GE(x, 0);
+        ASSERT_LT(x, 24);
+        sum += x;
+        squares += x * x;
+    }
+    const double n = kCount;
+    EXPECT_NEAR(sum / n, 1, 5 / std::sqrt(n));                        // its variance is 1
+    EXPECT_NEAR(squares / n, 2, 5 * std::sqrt(20.0) / std::sqrt(n));  // E[x^4] - 4 = 20
+}
+
+TEST(Rng, EveryPartOfItsNameMatters) {
+    const uint64_t base = trk::Rng(1, 1, 1, 1).next();
+    EXPECT_EQ(trk::Rng(1, 1, 1, 1).next(), base);
+    EXPECT_NE(trk::Rng(2, 1, 1, 1).next(), base);
+    EXPECT_NE(trk::Rng(1, 2, 1, 1).next(), base);
+    EXPECT_NE(trk::Rng(1, 1, 2, 1).next(), base);
+    EXPECT_NE(trk::Rng(1, 1, 1, 2).next(), base);
+}
+
+double robust(double min, double mean, double max, double diagonal) {
+    return trk::SuperVoxels::chooseControl(TRK_CHOICE_ROBUST, min, mean, max, diagonal);
+}
+
+TEST(RobustControl, MatchesTheKnownFactors) {
+    // FACTS of the formula: (2^(1/(D S)) - 1) is 0.41 at D S = 2, 0.19 at 4, 0.07 at 10.
+    EXPECT_NEAR(robust(0, 1, 1, 2), 0.4142, 1e-4);
+    EXPECT_NEAR(robust(0, 1, 1, 4), 0.1892, 1e-4);
+    EXPECT_NEAR(robust(0, 1, 1, 10), 0.0718, 1e-4);
+    EXPECT_EQ(robust(0, 0.5, 1, 0.5), 0.5);  // thin: the mean
+}
+
+TEST(RobustControl, IsFiniteAndBetweenMinAndMeanAtTheExtremes) {
+    for (const double range : {0.0, 1e-45, 1e-30, 1e-4, 1.0, 1e30, 3e38}) {
+        for (const double diagonal : {1e-12, 1e-3, 1.0, 1e12}) {
+            const double min = 0.25 * range;
+            const double mean = 0.5 * range;
+            const double control = robust(min, mean, range, diagonal);
+            EXPECT_GE(control, min);
+            EXPECT_LE(control, mean);
+        }
+    }
+    EXPECT_EQ(robust(2, 2, 2, 1), 2);  // 0 x infinity in the formula as printed
+}
+
+TEST(SuperVoxels, BoundsCoverTheResidualOfEveryChoice) {
+    for (const TrkChoice choice :
+         {TRK_CHOICE_ROBUST, TRK_CHOICE_MEAN, TRK_CHOICE_MIN, TRK_CHOICE_MAX}) {
+        trk::BakedVolume baked;
+        baked.table = trk::SparseTable(4, {{{0, 0, 0}}, {{16, 16, 16}}});
+        baked.table.fill([](const trk::Int3&, int) { return std::nullopt; },
+                         [](const trk::Int3&) { return 1u; });
+        baked.items.push_back({0.1f, 0.7f, 0.3f, 0.4f, 0.2f});
+        const float scale = 3.3f;
+        const trk::SuperVoxels opened(std::move(baked), scale, choice, 0.05);
+        trk::LocalRay ray;
+        ray.direction[0] = 1;
+        ray.inverse = {{1, 1e300, 1e300}};
+        ray.tEnd = 16;
+        int met = 0;
+        opened.walk(ray, 0, 16, [&](const trk::SuperVoxel& v, double, double) {
+            ++met;
+            for (const float density : {0.1f, 0.3f, 0.7f}) {
+                const double residual = static_cast<double>(scale) * static_cast<double>(density) -
+                                        static_cast<double>(v.control);
+                EXPECT_LE(std::fabs(residual), static_cast<double>(v.bound));
+            }
+            return true;
+        });
+        EXPECT_EQ(met, 1);
+    }
+}
+
+TEST(AffineMap, InverseUndoesExtremeMaps) {
+    for (const double voxel : {1e-120, 1e-9, 1.0, 1e9}) {
+        trk::AffineMap map;
+        const double rows[3][3] = {{voxel, 0.3 * voxel, 0}, {0, 1e-6 * voxel, 0}, {0, 0, -voxel}};
+        for (int i = 0; i < 3; ++i) {
+            for (int j = 0; j < 3; ++j) {
+                map.linear[i][j] = rows[i][j];
+            }
+            map.translation[i] = 1e3 * voxel * (i + 1);
+        }
+        const trk::AffineMap inverse = map.inverse();
+        const trk::Vec3d p{{12.5, -7.25, 100}};
+        const trk::Vec3d q = inverse.point(map.point(p));
+        for (int a = 0; a < 3; ++a) {
+            EXPECT_NEAR(q[a], p[a], 1e-6);
+        }
+    }
+}
+
+}  // namespace

@@ -1,0 +1,275 @@
+// SPDX-License-Identifier: Apache-2.0
+// The sidecar: what is written is read, and nothing that does not fit is accepted.
+#include "io/sidecar.h"
+
+#include "bake.h"
+#include "error.h"
+#include "io/vdb_file.h"
+#include "support/fixtures.h"
+#include "verify.h"
+
+#include <gtest/gtest.h>
+
+#include <cstring>
+#include <functional>
+#include <map>
+
+namespace {
+
+using openvdb::Coord;
+using Grids = std::map<std::string, openvdb::GridBase::Ptr>;
+
+struct Baked {
+    std::string vdb;
+    std::string sidecar;
+    trk::Density density;
+};
+
+Baked makeBaked(const std::string& name, int size = 8) {
+    auto grid = fixtures::makeBlob(45);
+    grid->tree().addTile(1, Coord(16, 16, 16), 0.5f, true);
+    grid->transform().postTranslate(openvdb::Vec3d(3, 4, 5));
+    grid->transform().preScale(0.1);
+    Baked baked;
+    baked.vdb = fixtures::write(name + ".vdb", {grid});
+    baked.sidecar = fixtures::path(name + ".track.vdb");
+    fixtures::bake(baked.vdb, baked.sidecar, size);
+    baked.density = fixtures::load(baked.vdb);
+    return baked;
+}
+
+/// Rewrites a sidecar after `change` had its way with the grids.
+std::string altered(const Baked& baked, const std::string& name,
+                    const std::function<void(Grids&)>& change) {
+    openvdb::io::File file(baked.sidecar);
+    file.open();
+    Grids grids;
+    for (const auto& grid : *file.getGrids()) {
+        grids[grid->getName()] = grid;
+    }
+    change(grids);
+    openvdb::GridCPtrVec all;
+    for (const auto& [ignored, grid] : grids) {
+        all.push_back(grid);
+    }
+    return fixtures::write(name, all);
+}
+
+openvdb::FloatGrid& floatGrid(Grids& grids, const std::string& name) {
+    return *openvdb::gridPtrCast<openvdb::FloatGrid>(grids.at(name));
+}
+
+void expectRefused(const Baked& baked, const std::string& sidecar, TrkStatus status,
+                   const std::string& text) {
+    try {
+        trk::readSidecar(sidecar, &baked.density.summary, TRK_CHECK_FULL);
+        ADD_FAILURE() << "accepted; expected: " << text;
+    } catch (const trk::Error& e) {
+        EXPECT_EQ(e.status(), status) << e.what();
+        EXPECT_NE(std::string(e.what()).find(text), std::string::npos) << e.what();
+        EXPECT_NE(std::string(e.what()).find(sidecar), std::string::npos) << e.what();
+    }
+}
+
+TEST(Sidecar, ReadsBackWhatWasWritten) {
+    for (const int size : {4, 16, 64}) {
+        const Baked baked = makeBaked("roundtrip" + std::to_string(size), size);
+        const trk::BakedVolume expected = vdbtools::bake(baked.density.field, size, 2);
+        const trk::Sidecar read =
+            trk::readSidecar(baked.sidecar, &baked.density.summary, TRK_CHECK_FULL);
+        EXPECT_EQ(read.header.superVoxelSize, size);
+        EXPECT_EQ(read.header.digest, baked.density.summary.digest);
+        ASSERT_EQ(read.baked.levels.size(), 2u);
+        size_t compared = 0;
+        expected.table.forEach([&](const trk::Int3& lo, int, trk::SparseTable::Entry entry) {
+            const auto found = read.baked.table.find(lo[0], lo[1], lo[2]);
+            ASSERT_NE(found.entry, trk::SparseTable::kEmpty);
+            EXPECT_EQ(std::memcmp(&read.baked.items[found.entry - 1], &expected.items[entry - 1],
+                                  sizeof(trk::BakedSuperVoxel)),
+                      0);
+            ++compared;
+        });
+        EXPECT_GT(compared, 0u);
+        const trk::Sidecar alone = trk::readSidecar(baked.sidecar, nullptr, TRK_CHECK_FULL);
+        for (int a = 0; a < 3; ++a) {
+            EXPECT_NEAR(alone.header.indexToWorld.translation[a],
+                        baked.density.summary.indexToWorld.translation[a], 1e-12);
+            EXPECT_NEAR(alone.header.indexToWorld.linear[a][a], 0.1, 1e-15);
+        }
+    }
+}
+
+TEST(Sidecar, IsAPlainVdbWhoseGridsLieOverTheSource) {
+    const Baked baked = makeBaked("plain", 8);
+    openvdb::io::File file(baked.sidecar);
+    file.open();
+    for (const char* name : {"density_control", "density_majorant", "density_rms", "density_min",
+                             "density_max", "density_control_level_1", "density_control_level_2"}) {
+        ASSERT_TRUE(file.hasGrid(name)) << name;
+        const auto grid = file.readGrid(name);
+        EXPECT_EQ(grid->metaValue<std::string>("track_format"), "1.0");
+        EXPECT_EQ(grid->metaValue<std::string>("track_source_grid"), "density");
+        EXPECT_EQ(grid->metaValue<int32_t>("track_super_voxel_size"), 8);
+    }
+    const auto control = file.readGrid("density_control");
+    // Index i lies at source index 8 i + 4, in world space 0.1 (8 i + 4) + (3, 4, 5).
+    const openvdb::Vec3d world = control->indexToWorld(openvdb::Vec3d(1, 2, 3));
+    EXPECT_NEAR(world.x(), 0.1 * 12 + 3, 1e-12);
+    EXPECT_NEAR(world.z(), 0.1 * 28 + 5, 1e-12);
+    const auto level = file.readGrid("density_control_level_1");
+    EXPECT_NEAR(level->indexToWorld(openvdb::Vec3d(1, 0, 0)).x(), 0.1 * 24 + 3, 1e-12);
+}
+
+TEST(Sidecar, EmptyVolumesHaveSidecarsToo) {
+    openvdb::initialize();
+    auto grid = openvdb::FloatGrid::create();
+    grid->setName("density");
+    const std::string vdb = fixtures::write("nothing.vdb", {grid});
+    const std::string sidecar = fixtures::path("nothing.track.vdb");
+    fixtures::bake(vdb, sidecar, 16);
+    const trk::Density density = fixtures::load(vdb);
+    const trk::Sidecar read = trk::readSidecar(sidecar, &density.summary, TRK_CHECK_FULL);
+    EXPECT_TRUE(read.baked.items.empty());
+}
+
+TEST(Sidecar, UnnamedAndDoubleSources) {
+    openvdb::initialize();
+    auto grid = openvdb::DoubleGrid::create();
+    for (int i = 0; i < 30; ++i) {
+        grid->tree().setValue(Coord(i, i, 3), 0.1 * i);
+    }
+    const std::string vdb = fixtures::write("nameless.vdb", {grid});
+    const std::string sidecar = fixtures::path("nameless.track.vdb");
+    fixtures::bake(vdb, sidecar, 4);
+    const trk::Density density = fixtures::load(vdb);
+    const trk::Sidecar read = trk::readSidecar(sidecar, &density.summary, TRK_CHECK_FULL);
+    EXPECT_EQ(read.header.valueType, "double");
+    EXPECT_TRUE(vdbtools::verify(density.summary, read).holds);
+    openvdb::io::File file(sidecar);
+    file.open();
+    EXPECT_TRUE(file.readGrid("density_control")->isType<openvdb::DoubleGrid>());
+}
+
+TEST(Sidecar, RefusesAnotherDensityGridOrTransform) {
+    const Baked baked = makeBaked("mismatch");
+    Baked other = baked;
+    other.density.summary.digest ^= 1;
+    expectRefused(other, baked.sidecar, TRK_ERROR_SIDECAR_MISMATCH, "baked from other voxels");
+    EXPECT_NO_THROW(trk::readSidecar(baked.sidecar, &other.density.summary, TRK_CHECK_METADATA));
+    other = baked;
+    other.density.summary.grid.name = "heat";
+    expectRefused(other, baked.sidecar, TRK_ERROR_SIDECAR_MISMATCH, "baked from grid \"density\"");
+    other = baked;
+    other.density.summary.indexToWorld.linear[1][1] *= 1.001;
+    expectRefused(other, baked.sidecar, TRK_ERROR_SIDECAR_MISMATCH, "another transform");
+    other = baked;
+    other.density.summary.valueType = "double";
+    expectRefused(other, baked.sidecar, TRK_ERROR_SIDECAR_MISMATCH, "baked from a float grid");
+}
+
+TEST(Sidecar, RefusesNewerFormatsAndForeignFiles) {
+    const Baked baked = makeBaked("format");
+    const auto withFormat = [&](const char* name, const char* format) {
+        return altered(baked, name, [&](Grids& grids) {
+            for (auto& [ignored, grid] : grids) {
+                grid->insertMeta("track_format", openvdb::StringMetadata(format));
+            }
+        });
+    };
+    expectRefused(baked, withFormat("newer.vdb", "2.0"), TRK_ERROR_SIDECAR_MISMATCH, "format 2.0");
+    EXPECT_NO_THROW(
+        trk::readSidecar(withFormat("minor.vdb", "1.7"), &baked.density.summary, TRK_CHECK_FULL));
+    expectRefused(baked, withFormat("odd.vdb", "x"), TRK_ERROR_BAD_FILE, "format is");
+    expectRefused(baked, baked.vdb, TRK_ERROR_BAD_FILE, "expected a sidecar");
+    const std::string extra = altered(baked, "extra.vdb", [](Grids& grids) {
+        auto grid = openvdb::FloatGrid::create();
+        grid->setName("density_something_new");
+        grids[grid->getName()] = grid;
+    });
+    EXPECT_NO_THROW(trk::readSidecar(extra, &baked.density.summary, TRK_CHECK_FULL));
+}
+
+TEST(Sidecar, RefusesMissingOrMixedGrids) {
+    const Baked baked = makeBaked("missing");
+    for (const char* name : {"density_control", "density_majorant", "density_rms", "density_min",
+                             "density_max", "density_control_level_2"}) {
+        const std::string file =
+            altered(baked, "missing-one.vdb", [&](Grids& grids) { grids.erase(name); });
+        expectRefused(baked, file, TRK_ERROR_BAD_FILE,
+                      std::string(name) == "density_control" ? "" : name);
+    }
+    const std::string mixed = altered(baked, "mixed.vdb", [](Grids& grids) {
+        grids["density_max"]->insertMeta("track_source_digest", openvdb::StringMetadata("0"));
+    });
+    expectRefused(baked, mixed, TRK_ERROR_BAD_FILE, "another bake");
+}
+
+TEST(Sidecar, RefusesImplausibleBounds) {
+    const Baked baked = makeBaked("bounds");
+    const Coord at(2, 3, 3);
+    const auto with = [&](const std::string& grid, float value) {
+        return altered(baked, "bounds-changed.vdb", [&](Grids& grids) {
+            floatGrid(grids, "density_" + grid).tree().setValue(at, value);
+        });
+    };
+    const float nan = std::numeric_limits<float>::quiet_NaN();
+    expectRefused(baked, with("majorant", 0), TRK_ERROR_BAD_FILE, "majorant 0 with an RMS above 0");
+    expectRefused(baked, with("majorant", 1e-5f), TRK_ERROR_BAD_FILE, "does not bound");
+    expectRefused(baked, with("max", nan), TRK_ERROR_BAD_FILE, "NaN");
+    expectRefused(baked, with("min", -1), TRK_ERROR_BAD_FILE, "negative");
+    expectRefused(baked, with("control", 100), TRK_ERROR_BAD_FILE, "between min and max");
+    expectRefused(baked, with("rms", 100), TRK_ERROR_BAD_FILE, "RMS above its majorant");
+    const std::string hole = altered(baked, "hole.vdb", [&](Grids& grids) {
+        floatGrid(grids, "density_max").tree().setActiveState(at, false);
+    });
+    expectRefused(baked, hole, TRK_ERROR_BAD_FILE, "not active in the same");
+}
+
+TEST(Verify, ProvesAGoodBakeAndFindsEveryLie) {
+    const Baked baked = makeBaked("verify", 8);
+    trk::Sidecar sidecar = trk::readSidecar(baked.sidecar, &baked.density.summary, TRK_CHECK_FULL);
+    EXPECT_TRUE(vdbtools::verify(baked.density.summary, sidecar).holds);
+    const auto verifyChanged = [&](float trk::BakedSuperVoxel::*field, float factor) {
+        // The widest super-voxel, so that every change below matters.
+        trk::Sidecar changed;
+        changed.header = sidecar.header;
+        changed.anchor = sidecar.anchor;
+        changed.baked.superVoxelShift = sidecar.baked.superVoxelShift;
+        changed.baked.table = sidecar.baked.table;
+        changed.baked.items = sidecar.baked.items;
+        size_t widest = 0;
+        for (size_t i = 0; i < changed.baked.items.size(); ++i) {
+            const auto& item = changed.baked.items[i];
+            const auto& best = changed.baked.items[widest];
+            if (item.min > 0 && (best.min == 0 || item.rms > best.rms)) {
+                widest = i;
+            }
+        }
+        changed.baked.items[widest].*field *= factor;
+        return vdbtools::verify(baked.density.summary, changed).counterexample;
+    };
+    using V = trk::BakedSuperVoxel;
+    EXPECT_NE(verifyChanged(&V::min, 1.001f).find("min"), std::string::npos);
+    EXPECT_NE(verifyChanged(&V::max, 0.999f).find("max"), std::string::npos);
+    EXPECT_NE(verifyChanged(&V::majorant, 0.999f).find("majorant"), std::string::npos);
+    EXPECT_NE(verifyChanged(&V::rms, 0.999f).find("RMS"), std::string::npos);
+    EXPECT_NE(verifyChanged(&V::control, 1.00001f), "");
+
+    trk::SparseTable::Entry dropped = 0;
+    trk::Sidecar holed;
+    holed.header = sidecar.header;
+    holed.anchor = sidecar.anchor;
+    holed.baked.superVoxelShift = sidecar.baked.superVoxelShift;
+    holed.baked.items = sidecar.baked.items;
+    holed.baked.table = sidecar.baked.table.mapped([&](trk::SparseTable::Entry e) {
+        if (dropped == 0) {
+            dropped = e;
+        }
+        return e == dropped ? trk::SparseTable::kEmpty : e;
+    });
+    EXPECT_NE(
+        vdbtools::verify(baked.density.summary, holed).counterexample.find("not in the sidecar"),
+        std::string::npos);
+}
+
+}  // namespace

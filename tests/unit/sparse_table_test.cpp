@@ -1,0 +1,181 @@
+// SPDX-License-Identifier: Apache-2.0
+#include "sparse_table.h"
+
+#include <gtest/gtest.h>
+
+#include <map>
+#include <random>
+#include <set>
+
+namespace {
+
+using trk::Int3;
+using trk::IntBox;
+using trk::LocalRay;
+using trk::SparseTable;
+using trk::Vec3d;
+
+IntBox cube(int64_t size) {
+    return {{{0, 0, 0}}, {{size, size, size}}};
+}
+
+/// A table of items of 8^3 voxels, occupied by a hash of the position.
+SparseTable randomTable(int64_t size) {
+    SparseTable table(3, cube(size));
+    table.fill([](const Int3&, int) { return std::nullopt; },
+               [](const Int3& at) {
+                   const auto hash = static_cast<uint64_t>(at[0] * 73856093 ^ at[1] * 19349663 ^
+                                                           at[2] * 83492791);
+                   return hash % 3 == 0 ? static_cast<SparseTable::Entry>(1 + hash % 1000)
+                                        : SparseTable::kEmpty;
+               });
+    return table;
+}
+
+LocalRay makeRay(const Vec3d& origin, const Vec3d& direction, double tEnd) {
+    LocalRay ray;
+    const double norm = length(direction);
+    ray.origin = origin;
+    for (int a = 0; a < 3; ++a) {
+        ray.direction[a] = direction[a] / norm;
+        ray.inverse[a] = direction[a] == 0 ? 1e300 : 1 / ray.direction[a];
+    }
+    ray.tEnd = tEnd;
+    return ray;
+}
+
+struct Segment {
+    SparseTable::Entry entry;
+    Int3 lo;
+    int shift;
+    double t0;
+    double t1;
+};
+
+std::vector<Segment> segments(const SparseTable& table, const LocalRay& ray) {
+    std::vector<Segment> result;
+    table.walk(ray, 0, ray.tEnd,
+               [&](SparseTable::Entry entry, const Int3& lo, int shift, double t0, double t1) {
+                   result.push_back({entry, lo, shift, t0, t1});
+                   return true;
+               });
+    return result;
+}
+
+TEST(SparseTable, FindsWhatWasFilled) {
+    const SparseTable table = randomTable(200);
+    size_t occupied = 0;
+    table.forEach([&](const Int3& lo, int shift, SparseTable::Entry entry) {
+        ++occupied;
+        EXPECT_EQ(shift, 3);
+        const auto found = table.find(lo[0] + 7, lo[1], lo[2] + 3);
+        EXPECT_EQ(found.entry, entry);
+    });
+    EXPECT_GT(occupied, 1000u);
+    EXPECT_EQ(table.find(-1, 0, 0).entry, SparseTable::kEmpty);
+    EXPECT_EQ(table.find(0, 1 << 20, 0).entry, SparseTable::kEmpty);
+}
+
+TEST(SparseTable, FullTableCoversTheWholeInterval) {
+    SparseTable table(3, cube(256));
+    table.fill([](const Int3&, int) { return std::nullopt; },
+               [](const Int3& at) { return static_cast<SparseTable::Entry>(1 + at[0]); });
+    std::mt19937_64 random(7);
+    std::uniform_real_distribution<double> unit(0, 1);
+    std::vector<LocalRay> rays;
+    for (int i = 0; i < 300; ++i) {
+        const Vec3d a{{256 * unit(random), 256 * unit(random), 256 * unit(random)}};
+        const Vec3d b{{256 * unit(random), 256 * unit(random), 256 * unit(random)}};
+        rays.push_back(makeRay(a, b - a, length(b - a)));
+    }
+    // Along faces, edges and through corners; zero and negative zero components; backwards.
+    rays.push_back(makeRay({{0, 64, 64}}, {{1, 0, -0.0}}, 256));
+    rays.push_back(makeRay({{256, 8, 8}}, {{-1, -0.0, 0}}, 256));
+    rays.push_back(makeRay({{0, 0, 0}}, {{1, 1, 1}}, 256 * std::sqrt(3.0)));
+    rays.push_back(makeRay({{256, 256, 256}}, {{-1, -1, -1}}, 256 * std::sqrt(3.0)));
+    rays.push_back(makeRay({{0, 256, 128}}, {{1, -1, 0}}, 256 * std::sqrt(2.0)));
+    rays.push_back(makeRay({{3, 3, 3}}, {{1, 1e-12, -1e-12}}, 200));
+    for (const LocalRay& ray : rays) {
+        const auto met = segments(table, ray);
+        ASSERT_FALSE(met.empty());
+        EXPECT_EQ(met.front().t0, 0);
+        for (size_t i = 0; i < met.size(); ++i) {
+            EXPECT_LT(met[i].t0, met[i].t1);
+            if (i > 0) {
+                EXPECT_EQ(met[i].t0, met[i - 1].t1);  // to the bit: abutting, no gap
+            }
+            const Vec3d middle = ray.at(0.5 * (met[i].t0 + met[i].t1));
+            for (int a = 0; a < 3; ++a) {
+                EXPECT_GE(middle[a], static_cast<double>(met[i].lo[static_cast<size_t>(a)]) - 1e-9);
+                EXPECT_LE(middle[a],
+                          static_cast<double>(met[i].lo[static_cast<size_t>(a)] + 8) + 1e-9);
+            }
+        }
+        EXPECT_NEAR(met.back().t1, ray.tEnd, 1e-9);
+    }
+}
+
+TEST(SparseTable, WalkMeetsWhatDenseSamplingMeets) {
+    const SparseTable table = randomTable(256);
+    std::mt19937_64 random(3);
+    std::uniform_real_distribution<double> unit(0, 256);
+    for (int i = 0; i < 100; ++i) {
+        const Vec3d a{{unit(random), unit(random), unit(random)}};
+        const Vec3d b{{unit(random), unit(random), unit(random)}};
+        const LocalRay ray = makeRay(a, b - a, length(b - a));
+        double walked = 0;
+        for (const Segment& s : segments(table, ray)) {
+            walked += s.entry * (s.t1 - s.t0);
+        }
+        constexpr int kSteps = 20000;
+        double sampled = 0;
+        for (int k = 0; k < kSteps; ++k) {
+            const Vec3d p = ray.at((k + 0.5) / kSteps * ray.tEnd);
+            sampled += table
+                           .find(static_cast<int64_t>(p[0]), static_cast<int64_t>(p[1]),
+                                 static_cast<int64_t>(p[2]))
+                           .entry;
+        }
+        sampled *= ray.tEnd / kSteps;
+        EXPECT_NEAR(walked, sampled, 0.01 * sampled + 500 * ray.tEnd / kSteps * 30);
+    }
+}
+
+TEST(SparseTable, CrossesAHugeGapInAFewSteps) {
+    constexpr int64_t kFar = int64_t{1} << 31;
+    SparseTable table(3, cube(kFar + 8));
+    int asked = 0;
+    table.fill(
+        [&](const Int3& at, int shift) -> std::optional<SparseTable::Entry> {
+            ++asked;
+            const int64_t size = int64_t{1} << shift;
+            const bool near = at[0] == 0 && at[1] == 0 && at[2] == 0;
+            const bool far = at[0] <= kFar && at[0] + size > kFar && at[1] <= kFar &&
+                             at[1] + size > kFar && at[2] <= kFar && at[2] + size > kFar;
+            return near || far ? std::nullopt : std::optional(SparseTable::kEmpty);
+        },
+        [](const Int3& at) { return at[0] == 0 ? 1u : 2u; });
+    EXPECT_LT(asked, 100000);
+    EXPECT_LT(table.bytes(), 500000u);
+    const double half = 0.5 * std::sqrt(3.0);
+    const auto met = segments(
+        table, makeRay({{0, 0, 0}}, {{1, 1, 1}}, static_cast<double>(kFar) * 2 * half + 8));
+    ASSERT_EQ(met.size(), 2u);
+    EXPECT_EQ(met[0].entry, 1u);
+    EXPECT_EQ(met[1].entry, 2u);
+    EXPECT_NEAR(met[0].t1 - met[0].t0, 8 * std::sqrt(3.0), 1e-6);
+}
+
+TEST(SparseTable, MappingCollapsesWhatBecameUniform) {
+    const SparseTable table = randomTable(64);
+    const SparseTable collapsed =
+        table.mapped([](SparseTable::Entry) { return SparseTable::kEmpty; });
+    size_t occupied = 0;
+    collapsed.forEach([&](const Int3&, int, SparseTable::Entry) { ++occupied; });
+    EXPECT_EQ(occupied, 0u);
+    EXPECT_LT(collapsed.bytes(), table.bytes());
+    EXPECT_TRUE(collapsed.uniformEntry({{0, 0, 0}}, 6).has_value());
+    EXPECT_FALSE(table.uniformEntry({{0, 0, 0}}, 6).has_value());
+}
+
+}  // namespace

@@ -1,0 +1,120 @@
+// SPDX-License-Identifier: Apache-2.0
+// Volumes whose box or tiles are enormous must cost what their leaves cost.
+#include "support/fixtures.h"
+#include "support/rays.h"
+#include "track/track.hpp"
+#include "verify.h"
+
+#include <gtest/gtest.h>
+
+#include <cmath>
+#include <fstream>
+#include <string>
+
+namespace {
+
+/// A line of /proc/self/status, in kB: VmRSS (resident now) or VmHWM (its peak).
+long statusKilobytes(const std::string& key) {
+    std::ifstream stream("/proc/self/status");
+    std::string line;
+    while (std::getline(stream, line)) {
+        if (line.compare(0, key.size() + 1, key + ":") == 0) {
+            return std::stol(line.substr(key.size() + 1));
+        }
+    }
+    return -1;
+}
+
+void resetPeak() {
+    std::ofstream("/proc/self/clear_refs") << 5;
+}
+
+constexpr bool kSanitized =
+#if defined(__SANITIZE_ADDRESS__) || defined(__SANITIZE_THREAD__)
+    true;
+#else
+    false;
+#endif
+
+/// Bakes, opens and answers 1e5 rays; the peak of resident memory over all of it, in kB.
+long peakOf(const std::string& vdb, const std::vector<TrkRay>& all, double& meanTransmittance) {
+    const std::string sidecar = vdb + ".track.vdb";
+    resetPeak();
+    const long before = statusKilobytes("VmRSS");
+    fixtures::bake(vdb, sidecar, 16, 4);
+    const track::Volume volume = track::Volume::open(vdb, sidecar.c_str());
+    std::vector<float> transmittance(all.size());
+    TrkQuery query = trkDefaultQuery();
+    volume.estimateTransmittance(query, all.data(), all.size(), transmittance.data());
+    meanTransmittance = 0;
+    for (const float t : transmittance) {
+        meanTransmittance += static_cast<double>(t) / static_cast<double>(all.size());
+    }
+    return statusKilobytes("VmHWM") - before;
+}
+
+TEST(SparseVolumes, TwoPuffsFarApart) {
+    auto grid = fixtures::makeBlob(32);
+    const openvdb::Coord offset(100000, 100000, 100000);
+    auto second = fixtures::makeBlob(32);
+    for (auto it = second->cbeginValueOn(); it; ++it) {
+        grid->tree().setValue(it.getCoord() + offset, *it);
+    }
+    const std::string vdb = fixtures::write("puffs.vdb", {grid});
+    second.reset();
+    grid.reset();
+    // Along the diagonal, through both puffs.
+    std::vector<TrkRay> all(100000);
+    for (size_t i = 0; i < all.size(); ++i) {
+        const float offsetX = static_cast<float>(i % 100) * 0.1f;
+        all[i] = {{-10 + offsetX, -10, -10}, 0, {1, 1, 1}, rays::kInfinity};
+    }
+    double mean = 0;
+    const long peak = peakOf(vdb, all, mean);
+    EXPECT_GT(mean, 0);
+    EXPECT_LT(mean, 0.5);
+    if (!kSanitized) {
+        EXPECT_LT(peak, 64 * 1024);
+    }
+    const track::Volume volume = track::Volume::open(vdb, (vdb + ".track.vdb").c_str());
+    TrkQuery query = trkDefaultQuery();
+    float transmittance = 0;
+    TrkStatistics statistics;
+    volume.estimateTransmittance(query, all.data(), 1, &transmittance, &statistics);
+    EXPECT_LT(statistics.superVoxels, 20u);
+}
+
+TEST(SparseVolumes, AHugeConstantTile) {
+    openvdb::initialize();
+    auto grid = openvdb::FloatGrid::create();
+    grid->setName("density");
+    grid->tree().addTile(3, openvdb::Coord(0, 0, 0), 0.001f, true);
+    const std::string vdb = fixtures::write("hugetile.vdb", {grid});
+    grid.reset();
+    const rays::Box box{{0, 0, 0}, {4096, 4096, 4096}};
+    double mean = 0;
+    const long peak = peakOf(vdb, rays::through(box, 100000, 8000, 5), mean);
+    EXPECT_GT(mean, 0.01);
+    EXPECT_LT(mean, 0.9);
+    if (!kSanitized) {
+        EXPECT_LT(peak, 64 * 1024);
+    }
+}
+
+TEST(SparseVolumes, ALargeTileIsProvedToo) {
+    openvdb::initialize();
+    auto grid = openvdb::FloatGrid::create();
+    grid->setName("density");
+    grid->tree().addTile(2, openvdb::Coord(0, 0, 0), 0.5f, true);
+    grid->tree().addTile(2, openvdb::Coord(128, 0, 0), 0.5f, true);
+    grid->tree().addTile(2, openvdb::Coord(0, 128, 0), 0.25f, true);
+    const std::string vdb = fixtures::write("tiles128.vdb", {grid});
+    const std::string sidecar = fixtures::path("tiles128.track.vdb");
+    fixtures::bake(vdb, sidecar, 4);
+    const trk::Density density = fixtures::load(vdb);
+    const trk::Sidecar read = trk::readSidecar(sidecar, &density.summary, TRK_CHECK_FULL);
+    const vdbtools::VerifyReport report = vdbtools::verify(density.summary, read);
+    EXPECT_TRUE(report.holds) << report.counterexample;
+}
+
+}  // namespace

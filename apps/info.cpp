@@ -19,6 +19,15 @@ namespace {
 namespace po = boost::program_options;
 using Json = nlohmann::ordered_json;
 
+void addBounds(Json& json, const trk::AffineMap& map, const trk::Int3& anchor,
+               const trk::IntBox& box) {
+    double lo[3];
+    double hi[3];
+    trk::worldBounds(map, anchor, box, lo, hi);
+    json["bounds_min"] = lo;
+    json["bounds_max"] = hi;
+}
+
 /// One grid: what its metadata says and, for a grid that can be baked, what its voxels say.
 Json describeGrid(trk::VdbFile& file, const trk::VdbEntry& entry) {
     Json json;
@@ -42,6 +51,7 @@ Json describeGrid(trk::VdbFile& file, const trk::VdbEntry& entry) {
         json["active_voxels"] = density.summary.activeVoxels;
         json["min"] = density.summary.min;
         json["max"] = density.summary.max;
+        addBounds(json, density.summary.indexToWorld, density.summary.anchor, density.field.box());
         json["openvdb_bytes"] = density.summary.gridBytes;
         json["brick_bytes"] = density.field.bytes();
         json["bricks"] = density.field.brickCount();
@@ -76,6 +86,7 @@ Json describeSidecar(const std::string& path) {
     json["voxel_size"] = {length(header.indexToWorld.column(0)),
                           length(header.indexToWorld.column(1)),
                           length(header.indexToWorld.column(2))};
+    addBounds(json, header.indexToWorld, sidecar.anchor, sidecar.baked.table.occupiedBox());
     float max = 0;
     for (const trk::BakedSuperVoxel& item : sidecar.baked.items) {
         max = std::max(max, item.max);
@@ -88,6 +99,16 @@ Json describeSidecar(const std::string& path) {
         json["clamped_negative"] = header.clamped;
     }
     return json;
+}
+
+std::string formatBounds(const Json& json) {
+    char text[160];
+    const Json& lo = json["bounds_min"];
+    const Json& hi = json["bounds_max"];
+    std::snprintf(text, sizeof(text), "(%.6g, %.6g, %.6g) to (%.6g, %.6g, %.6g)",
+                  lo[0].get<double>(), lo[1].get<double>(), lo[2].get<double>(),
+                  hi[0].get<double>(), hi[1].get<double>(), hi[2].get<double>());
+    return text;
 }
 
 /// 3 numbers as "a x b x c", or once where they agree.
@@ -142,6 +163,7 @@ void run(const Command& command, const std::vector<std::string>& given) {
                   << "  control       " << json["control"].get<std::string>() << "\n"
                   << "  levels        " << json["levels"] << "\n"
                   << "  voxel size    " << formatSize(json["voxel_size"]) << "\n"
+                  << "  bounds        " << formatBounds(json) << "\n"
                   << "  density       up to " << json["max_density"].get<float>() << "\n"
                   << "  baked by      vdbtrack " << json["tool_version"].get<std::string>() << "\n";
         return;

@@ -210,21 +210,8 @@ TrkStatus trkGetVolumeInfo(const TrkVolume* handle, TrkVolumeInfo* info) {
         TrkVolumeInfo result{};
         result.size = sizeof(TrkVolumeInfo);
         const trk::IntBox& box = volume.hasDensity ? volume.field.box() : volume.superVoxels.box();
-        for (int corner = 0; corner < 8 && !box.empty(); ++corner) {
-            trk::Vec3d index;
-            for (int a = 0; a < 3; ++a) {
-                const auto axis = static_cast<size_t>(a);
-                index[a] = static_cast<double>(volume.anchor[axis] +
-                                               (corner >> a & 1 ? box.hi[axis] : box.lo[axis]));
-            }
-            const trk::Vec3d world = volume.indexToWorld.point(index);
-            for (int a = 0; a < 3; ++a) {
-                result.boundsMin[a] =
-                    corner == 0 ? world[a] : std::min(result.boundsMin[a], world[a]);
-                result.boundsMax[a] =
-                    corner == 0 ? world[a] : std::max(result.boundsMax[a], world[a]);
-            }
-        }
+        trk::worldBounds(volume.indexToWorld, volume.anchor, box, result.boundsMin,
+                         result.boundsMax);
         for (int row = 0; row < 3; ++row) {
             for (int column = 0; column < 3; ++column) {
                 result.indexToWorld[3 * row + column] = volume.indexToWorld.linear[row][column];

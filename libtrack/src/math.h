@@ -108,4 +108,25 @@ struct AffineMap {
     }
 };
 
+/// World-space box of an integer box of local space. Both ends 0 where that is empty.
+inline void worldBounds(const AffineMap& map, const Int3& anchor, const IntBox& box,
+                        double (&lo)[3], double (&hi)[3]) {
+    for (int a = 0; a < 3; ++a) {
+        lo[a] = hi[a] = 0;
+    }
+    for (int corner = 0; corner < 8 && !box.empty(); ++corner) {
+        Vec3d index;
+        for (int a = 0; a < 3; ++a) {
+            const auto axis = static_cast<size_t>(a);
+            index[a] =
+                static_cast<double>(anchor[axis] + (corner >> a & 1 ? box.hi[axis] : box.lo[axis]));
+        }
+        const Vec3d world = map.point(index);
+        for (int a = 0; a < 3; ++a) {
+            lo[a] = corner == 0 ? world[a] : std::min(lo[a], world[a]);
+            hi[a] = corner == 0 ? world[a] : std::max(hi[a], world[a]);
+        }
+    }
+}
+
 }  // namespace trk

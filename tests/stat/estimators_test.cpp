@@ -449,8 +449,8 @@ struct LyingSuperVoxels {
 TEST(Estimators, ABoundOfZeroWhereThereIsResidualIsRejected) {
     const Source source = sources().front();
     const std::string sidecar = sidecarOf(source, 8);
-    const Variant& variant = kVariants[1];
-    const Scene scene(source.vdb, sidecar, variant, 10, 300);
+    const Variant& variant = kVariants[3];  // over many rays, residuals of a mean control cancel
+    const Scene scene(source.vdb, sidecar, variant, 1, 300);
     const LyingSuperVoxels lying{scene.volume.superVoxels};
     expectRejected(
         scene, variant,

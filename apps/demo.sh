@@ -21,13 +21,13 @@ apps/install_packages.sh
 echo "Building (the first time, OpenVDB's headers make it take a minute or two) ..."
 log=build/demo.log
 mkdir -p build
-if ! { cmake -S . -B build/release -G Ninja -DCMAKE_BUILD_TYPE=Release -DTRACK_BUILD_TESTS=OFF &&
-       cmake --build build/release; } >"$log" 2>&1; then
+if ! { cmake -S . -B build/demo -G Ninja -DCMAKE_BUILD_TYPE=Release -DTRACK_BUILD_TESTS=OFF &&
+       cmake --build build/demo; } >"$log" 2>&1; then
     tail -n 30 "$log" >&2
     echo "demo.sh: the build failed; its output is in $log" >&2
     exit 1
 fi
-vdbtrack=build/release/bin/vdbtrack
+vdbtrack=build/demo/bin/vdbtrack
 
 out=demo-output
 mkdir -p "$out"

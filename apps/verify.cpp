@@ -7,6 +7,7 @@
 #include "io/sidecar.h"
 #include "verify.h"
 
+#include <filesystem>
 #include <iostream>
 
 namespace apps {
@@ -25,7 +26,10 @@ void run(const Command& command, const std::vector<std::string>& given) {
     trk::DensityOptions densityOptions;
     densityOptions.gridNamed = arguments.has("grid");
     densityOptions.gridName = arguments.text("grid");
-    densityOptions.repair = repairBits(arguments) | trk::readSidecarHeader(path).repair;
+    densityOptions.repair = repairBits(arguments);
+    if (std::filesystem::exists(input)) {  // else that is what to say first
+        densityOptions.repair |= trk::readSidecarHeader(path).repair;
+    }
     const trk::DensitySummary summary = trk::loadDensity(input, densityOptions).summary;
     const trk::Sidecar sidecar = trk::readSidecar(path, &summary, TRK_CHECK_FULL);
     const vdbtools::VerifyReport report = vdbtools::verify(summary, sidecar);

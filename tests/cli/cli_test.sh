@@ -1,0 +1,390 @@
+#!/usr/bin/env bash
+# The program as its users meet it: cli_test.sh VDBTRACK CASE. Without a case, lists them.
+set -uo pipefail
+
+vdbtrack=${1:?usage: cli_test.sh VDBTRACK CASE}
+data=${TRACK_TEST_DATA:-}
+work=$(mktemp -d)
+trap 'rm -rf "$work"' EXIT
+cd "$work" || exit 1
+
+failures=0
+fail() {
+    echo "FAILED: $*" >&2
+    failures=$((failures + 1))
+}
+
+# expect CODE ARGUMENTS...: runs vdbtrack; stdout and stderr go to files of those names.
+expect() {
+    local code=$1
+    shift
+    "$vdbtrack" "$@" >stdout 2>stderr </dev/null
+    local found=$?
+    [ "$found" = "$code" ] || fail "vdbtrack $*: exit $found, expected $code: $(cat stderr)"
+}
+# One clear line on stderr that contains TEXT, and nothing on stdout.
+one_line() {
+    [ "$(wc -l <stderr)" = 1 ] || fail "expected one line on stderr, found: $(cat stderr)"
+    grep -qF -- "$1" stderr || fail "expected \"$1\" in: $(cat stderr)"
+    [ ! -s stdout ] || fail "data on stdout after an error: $(head -n 3 stdout)"
+}
+contains() {
+    grep -qF -- "$2" "$1" || fail "expected \"$2\" in $1: $(head -n 5 "$1")"
+}
+exists() { [ -s "$1" ] || fail "$1 is missing or empty"; }
+absent() { [ ! -e "$1" ] || fail "$1 exists"; }
+
+small_cloud() { "$vdbtrack" make cloud.vdb --voxels 48 --quiet || fail "make"; }
+baked_cloud() {
+    small_cloud
+    "$vdbtrack" bake cloud.vdb --size 8 --quiet || fail "bake"
+}
+some_rays() {
+    cat >rays.csv <<'CSV'
+# through the middle, along an axis, a miss, an interval
+ox,oy,oz,dx,dy,dz,tmin,tmax
+-5,4,5,1,0.02,0.01,0,inf
+5,20,5,0,-1,0,0,1000
+50,50,50,1,0,0,0,inf
+
+5,4,5,1,0,0,0,0.5
+CSV
+}
+
+case_help() {
+    expect 0 --help
+    contains stdout "vdbtrack bake IN.vdb"
+    expect 0 --version
+    contains stdout "vdbtrack 0."
+    for command in make bake info verify query preview; do
+        expect 0 "$command" --help
+        contains stdout "usage: vdbtrack $command"
+        [ ! -s stderr ] || fail "$command --help writes to stderr"
+    done
+    expect 0 bake --help
+    contains stdout "(=16)"
+}
+
+case_usage() {
+    small_cloud
+    expect 2
+    contains stderr "no command"
+    expect 2 paint
+    contains stderr 'unknown command "paint"'
+    usage() {
+        local text=$1
+        shift
+        expect 2 "$@"
+        contains stderr "$text"
+        contains stderr "usage: vdbtrack $1"
+        [ ! -s stdout ] || fail "usage error with data on stdout"
+    }
+    usage "--wrong" bake cloud.vdb --wrong
+    usage "missing argument IN.vdb" bake
+    usage "too many arguments" bake a.vdb b.vdb
+    usage "--size 12" bake cloud.vdb --size 12
+    usage "--size 128" bake cloud.vdb --size 128
+    usage "size" bake cloud.vdb --size big
+    usage "--control cubic" bake cloud.vdb --control cubic
+    usage "--levels 99" bake cloud.vdb --levels 99
+    usage "--threads -1" bake cloud.vdb --threads -1
+    usage "--kind fog" make x.vdb --kind fog
+    usage "--voxels 3" make x.vdb --voxels 3
+    usage "missing --rays" query cloud.vdb
+    usage "--method magic" query cloud.vdb --rays r.csv --method magic
+    usage "--choice best" query cloud.vdb --rays r.csv --choice best
+    usage "--samples 0" query cloud.vdb --rays r.csv --samples 0
+    usage "--rate" query cloud.vdb --rays r.csv --rate 0
+    usage "--scale" query cloud.vdb --rays r.csv --scale -1
+    usage "--scale" query cloud.vdb --rays r.csv --scale nan
+    usage "--resolution 0x5" preview x --resolution 0x5
+    usage "--resolution 70000x5" preview x --resolution 70000x5
+    usage "--resolution 5" preview x --resolution 5
+    usage "--view back" preview x --view back
+    usage "--camera 1,2" preview x --camera 1,2
+    usage ".png or .exr" preview x -o x.jpg
+    absent cloud.track.vdb
+    absent x.vdb
+}
+
+case_main_job() {
+    expect 0 make cloud.vdb --voxels 64
+    contains stderr "active voxels"
+    exists cloud.vdb
+    expect 0 bake cloud.vdb
+    exists cloud.track.vdb
+    expect 0 verify cloud.vdb
+    contains stderr "all bounds hold"
+    expect 0 info cloud.vdb
+    contains stdout "bake        yes"
+    expect 0 info cloud.track.vdb
+    contains stdout "16^3 voxels"
+    expect 0 preview cloud.track.vdb -o cloud.png --resolution 64x48
+    contains stderr "median transmittance 0.3"
+    [ "$(head -c 4 cloud.png | tail -c 3)" = PNG ] || fail "cloud.png is no PNG"
+    expect 0 preview cloud.track.vdb -o cloud.exr --level 1 --view top --scale 2
+    [ "$(od -An -tx1 -N4 cloud.exr | tr -d ' ')" = 762f3101 ] || fail "cloud.exr is no EXR"
+    for attribute in track:scale track:view track:source transmittance; do
+        grep -qa "$attribute" cloud.exr || fail "cloud.exr lacks $attribute"
+    done
+    expect 0 preview cloud.track.vdb
+    exists cloud.track.png
+    some_rays
+    expect 0 query cloud.vdb --rays rays.csv
+    [ "$(wc -l <stdout)" = 5 ] || fail "expected a header and 4 rows"
+}
+
+case_kinds_and_seeds() {
+    for kind in cloud smoke; do
+        expect 0 make $kind.vdb --kind $kind --voxels 48
+        expect 0 bake $kind.vdb --size 4
+        expect 0 verify $kind.vdb
+    done
+    expect 0 make a.vdb --voxels 48 --seed 1 --threads 1
+    expect 0 make b.vdb --voxels 48 --seed 1
+    expect 0 make c.vdb --voxels 48 --seed 2
+    # A sidecar fits any file with the same voxels, and no other.
+    expect 0 bake a.vdb
+    expect 0 verify b.vdb a.track.vdb
+    expect 1 verify c.vdb a.track.vdb
+    one_line "other voxels"
+}
+
+case_query_output() {
+    baked_cloud
+    some_rays
+    expect 0 query cloud.vdb --rays rays.csv --method exact
+    [ "$(head -n 1 stdout)" = "ray,transmittance,stderr,optical_depth,lookups" ] || fail "header"
+    [ "$(sed -n 4p stdout)" = "2,1,0,0,0" ] || fail "a miss: $(sed -n 4p stdout)"
+    awk -F, 'NR > 1 && ($2 < 0 || $2 > 1 || $3 != 0 || $4 < 0) { exit 1 }' stdout ||
+        fail "exact rows: $(cat stdout)"
+    cp stdout exact.csv
+    for method in residual ratio; do
+        for choice in robust mean min max; do
+            expect 0 query cloud.vdb --rays rays.csv --method $method --choice $choice \
+                --samples 4000
+            # Within 5 standard errors of the exact value (two misses have an error of 0).
+            paste -d, exact.csv stdout | awk -F, 'NR > 1 {
+                d = $2 - $7; if (d < 0) d = -d
+                if (d > 5 * $8 + 1e-6 || $9 != "") { print; exit 1 } }' >bad ||
+                fail "$method $choice: $(cat bad)"
+        done
+    done
+    expect 0 query cloud.vdb --rays rays.csv --samples 1
+    awk -F, 'NR > 1 && ($3 != "" || $4 != "") { exit 1 }' stdout || fail "one sample: $(cat stdout)"
+    expect 0 query cloud.vdb --rays rays.csv --method control --level 2
+    expect 0 query cloud.vdb --rays rays.csv -o out.csv
+    [ ! -s stdout ] || fail "-o writes to stdout too"
+    expect 0 query cloud.vdb --rays rays.csv
+    cmp -s stdout out.csv || fail "-o and stdout differ"
+    expect 0 query cloud.vdb --rays rays.csv --threads 1
+    cmp -s stdout out.csv || fail "one thread, other results"
+    expect 0 query cloud.vdb --rays rays.csv --seed 7
+    cmp -s stdout out.csv && fail "another seed, the same results"
+    expect 0 query cloud.vdb --rays rays.csv --stream 7
+    cmp -s stdout out.csv && fail "another stream, the same results"
+    expect 0 query cloud.vdb --rays rays.csv --scale 0
+    awk -F, 'NR > 1 && $2 != 1 { exit 1 }' stdout || fail "scale 0: $(cat stdout)"
+}
+
+case_bad_rays() {
+    baked_cloud
+    expect 1 query cloud.vdb --rays none.csv
+    one_line "none.csv: cannot be opened"
+    : >empty.csv
+    expect 0 query cloud.vdb --rays empty.csv
+    [ "$(cat stdout)" = "ray,transmittance,stderr,optical_depth,lookups" ] || fail "header alone"
+    bad() {
+        printf '%b' "$1" >bad.csv
+        expect 1 query cloud.vdb --rays bad.csv
+        one_line "$2"
+    }
+    bad '0,0,0,1,0,0\n0,0,0,1,0\n' "bad.csv: line 2: expected ox,oy,oz,dx,dy,dz[,tmin,tmax], found 5"
+    bad 'a,b,c,d,e,f\nx,0,0,1,0,0\n' "line 2"
+    bad '0,0,0,1,0,0,5\n' "found 7 numbers"
+    bad '0,0,0,1,0,zero\n' "line 1"
+    bad '0,0,0,1,0,0\n\n# fine\n0,0,0,0,0,0\n' "ray 1"
+    bad 'nan,0,0,1,0,0\n' "ray 0"
+    printf '0,0,0,1,0,0\r\n 0 , 0,0, +1,0,0 \r\n' >crlf.csv
+    expect 0 query cloud.vdb --rays crlf.csv
+    [ "$(wc -l <stdout)" = 3 ] || fail "CRLF and spaces"
+}
+
+case_bad_files() {
+    baked_cloud
+    some_rays
+    for command in "bake" "info" "verify" "query --rays rays.csv" "preview"; do
+        # shellcheck disable=SC2086
+        expect 1 $command missing.vdb
+        one_line "missing.vdb"
+    done
+    expect 1 bake "$work"
+    one_line "is a directory"
+    : >zero.vdb
+    expect 1 bake zero.vdb
+    one_line "zero.vdb: not a VDB file: the file is empty"
+    echo "just text, nothing else" >text.vdb
+    expect 1 bake text.vdb
+    one_line "looks like text"
+    size=$(stat -c %s cloud.vdb)
+    for part in 5 40 60 80 95; do
+        head -c $((size * part / 100)) cloud.vdb >cut.vdb
+        expect 1 bake cut.vdb
+        one_line "cut.vdb"
+        absent cut.track.vdb
+    done
+    head -c $(($(stat -c %s cloud.track.vdb) / 2)) cloud.track.vdb >cut.track.vdb
+    expect 1 preview cut.track.vdb
+    one_line "cut.track.vdb"
+    expect 1 preview cloud.vdb
+    one_line "expected a sidecar"
+    expect 1 bake cloud.vdb --grid heat -o heat.track.vdb
+    one_line 'no grid "heat"; the file has density'
+    absent heat.track.vdb
+    rm cloud.track.vdb
+    expect 1 query cloud.vdb --rays rays.csv
+    one_line "vdbtrack bake"
+    expect 0 query cloud.vdb --rays rays.csv --method exact
+    expect 1 verify cloud.vdb
+    one_line "cloud.track.vdb"
+}
+
+case_outputs() {
+    baked_cloud
+    cp cloud.track.vdb before.track.vdb
+    expect 1 bake cloud.vdb
+    one_line "--force"
+    cmp -s cloud.track.vdb before.track.vdb || fail "refused, yet changed"
+    expect 0 bake cloud.vdb --force
+    expect 1 bake cloud.vdb -o cloud.vdb --force
+    one_line "is the input"
+    expect 1 bake cloud.vdb -o no/such/folder.vdb
+    one_line "no/such/folder.vdb"
+    expect 1 make cloud.vdb
+    one_line "exists already"
+    expect 0 preview cloud.track.vdb -o p.png --resolution 16x16
+    expect 1 preview cloud.track.vdb -o p.png --resolution 16x16
+    one_line "exists already"
+    mkdir folder
+    expect 1 bake cloud.vdb -o folder
+    one_line "is a directory"
+    if [ "$(id -u)" -ne 0 ]; then
+        chmod a-w folder
+        expect 1 bake cloud.vdb -o folder/x.vdb
+        one_line "Permission denied"
+    fi
+    mkdir "with spaces äöü"
+    cp cloud.vdb "with spaces äöü/wölkchen 1.vdb"
+    expect 0 bake "with spaces äöü/wölkchen 1.vdb"
+    exists "with spaces äöü/wölkchen 1.track.vdb"
+    some_rays
+    if [ -w /dev/full ]; then
+        "$vdbtrack" query cloud.vdb --rays rays.csv >/dev/full 2>stderr
+        [ $? = 1 ] || fail "a full stdout must fail"
+        contains stderr "standard output"
+    fi
+    [ -z "$(find . -name '*.tmp*')" ] || fail "temporary files left: $(find . -name '*.tmp*')"
+}
+
+case_full_disk() {
+    small_cloud
+    # A file size limit acts like a full disk.
+    (
+        ulimit -f 8
+        trap '' XFSZ
+        "$vdbtrack" bake cloud.vdb --size 4 -o full.track.vdb >stdout 2>stderr
+        [ $? = 1 ] || exit 1
+    ) || fail "bake on a full disk: $(cat stderr)"
+    one_line "full.track.vdb: cannot be written"
+    absent full.track.vdb
+}
+
+case_signals() {
+    "$vdbtrack" make old.vdb --voxels 16 -q
+    cp old.vdb copy.vdb
+    for signal in INT TERM; do
+        "$vdbtrack" make old.vdb --voxels 512 --force -q &
+        pid=$!
+        sleep 0.3
+        kill -$signal $pid 2>/dev/null || fail "too fast to be interrupted"
+        wait $pid
+        found=$?
+        [ $found = $((128 + $(kill -l $signal))) ] || fail "exit $found after SIG$signal"
+        cmp -s old.vdb copy.vdb || fail "the old file changed"
+    done
+    [ "$(find . -name 'old*' | wc -l)" = 1 ] || fail "left behind: $(ls)"
+}
+
+case_two_bakes_at_once() {
+    small_cloud
+    for i in 1 2 3 4; do
+        "$vdbtrack" bake cloud.vdb --size 4 --force -q &
+    done
+    wait
+    expect 0 verify cloud.vdb
+}
+
+case_json() {
+    baked_cloud
+    expect 0 info cloud.vdb --json
+    contains stdout '"can_be_baked": true'
+    expect 0 info cloud.track.vdb --json
+    contains stdout '"super_voxel_size": 8'
+}
+
+case_real_volumes() {
+    [ -n "$data" ] || exit 77
+    try() { # FILE CODE TEXT
+        expect "$2" bake "$data/$1" -o out.track.vdb --force
+        contains stderr "$3"
+        [ "$2" = 0 ] || one_line "$3"
+        if [ "$2" = 0 ]; then
+            expect 0 verify "$data/$1" out.track.vdb
+            expect 0 preview out.track.vdb -o out.png --force --resolution 32x32
+        fi
+        rm -f out.track.vdb
+    }
+    try wdas_cloud_sixteenth.vdb 0 "super-voxels"
+    try smoke1.vdb 0 "super-voxels"
+    try density_and_heat.vdb 0 "super-voxels"
+    try torus.vdb 0 "super-voxels"
+    try sphere.vdb 0 "super-voxels"
+    try disney_fog_and_distance.vdb 0 "super-voxels"
+    try smoke_000002.vdb 0 "super-voxels"
+    try smoke_000001.vdb 0 "is empty"
+    try bad_bbox_bomb.vdb 0 "is empty"
+    try bad_bbox_empty.vdb 0 "is empty"
+    try bad_bbox_overflow.vdb 0 "is empty"
+    try three_grids_same_name.vdb 1 "density[0], density[1], density[2]"
+    try cube_levelset.vdb 1 "level set"
+    try unnamed_levelset.vdb 1 "level set"
+    try pointgrid.vdb 1 "ptdataidx32"
+    try sphere_points.vdb 1 "ptdataidx32"
+    try box_background_one.vdb 1 "background is 1"
+    try sphere_cd.vdb 1 "vec3s"
+    try smoke_blosc.nvdb 1 "NanoVDB"
+    expect 0 bake "$data/three_grids_same_name.vdb" --grid 'density[1]' -o one.track.vdb
+    expect 0 verify "$data/three_grids_same_name.vdb" one.track.vdb --grid 'density[1]'
+    expect 1 verify "$data/three_grids_same_name.vdb" one.track.vdb --grid 'density[2]'
+    one_line 'density"[1]'
+    for file in "$data"/*.vdb; do
+        expect 0 info "$file"
+    done
+}
+
+case_vdb_print() {
+    command -v vdb_print >/dev/null || exit 77
+    baked_cloud
+    vdb_print -l cloud.track.vdb >printed 2>&1 || fail "vdb_print: $(cat printed)"
+    for text in density_control density_majorant density_rms density_min density_max \
+        density_control_level_1 "track_super_voxel_size: 8" "track_source_grid: density"; do
+        contains printed "$text"
+    done
+}
+
+if [ $# -lt 2 ]; then
+    declare -F | sed -n 's/^declare -f case_//p'
+    exit 0
+fi
+"case_$2"
+exit $((failures > 0))

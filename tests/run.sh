@@ -25,7 +25,8 @@ check_format() {
 run_preset() {
     local preset=$1
     echo "== $preset =="
-    cmake --preset "$preset" -DTRACK_WERROR=ON -DCMAKE_CXX_COMPILER_LAUNCHER=ccache \
+    cmake --preset "$preset" -DTRACK_WERROR=ON -DTRACK_BUILD_TESTS=ON \
+        -DTRACK_BUILD_BENCH="$([ "$preset" = release ] && echo ON || echo OFF)" -DCMAKE_CXX_COMPILER_LAUNCHER=ccache \
         -DCMAKE_C_COMPILER_LAUNCHER=ccache >"build/configure-$preset.log" ||
         { cat "build/configure-$preset.log"; return 1; }
     cmake --build "build/$preset" >"build/build-$preset.log" 2>&1 ||

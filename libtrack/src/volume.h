@@ -16,11 +16,11 @@ namespace trk {
 /// coordinates are small and never negative. Multiples of 2^18 keep it aligned with every node of
 /// the density's tree (4096 voxels) and of a tree of super-voxels (4096 x 64 voxels).
 inline Int3 anchorFor(const IntBox& indexBox) {
-    constexpr int kShift = 18;
+    constexpr int64_t kStep = int64_t{1} << 18;
     Int3 anchor{{0, 0, 0}};
     if (!indexBox.empty()) {
         for (size_t a = 0; a < 3; ++a) {
-            anchor[a] = (indexBox.lo[a] >> kShift) << kShift;
+            anchor[a] = indexBox.lo[a] & ~(kStep - 1);
         }
     }
     return anchor;

@@ -1,0 +1,171 @@
+// SPDX-License-Identifier: Apache-2.0
+// Time per ray of every method, on the procedural cloud or the density in TRACK_BENCH_VOLUME, for
+// camera rays (coherent) and rays from anywhere inside (incoherent), on one thread. Counters:
+// density look-ups a ray, variance of one estimate. Compare rows of one run, not of two.
+#include "bake.h"
+#include "io/density.h"
+#include "support/fixtures.h"
+#include "support/rays.h"
+#include "track/track.hpp"
+
+#include <benchmark/benchmark.h>
+
+#include <cmath>
+#include <cstdlib>
+#include <map>
+#include <memory>
+#include <string>
+#include <vector>
+
+namespace {
+
+std::string volumeFile() {
+    const char* given = std::getenv("TRACK_BENCH_VOLUME");
+    return given ? given : fixtures::cloudFile(256);
+}
+
+std::vector<TrkRay> cameraRays(const rays::Box& box) {
+    constexpr int kSide = 128;
+    double eye[3];
+    double centre[3];
+    for (int a = 0; a < 3; ++a) {
+        centre[a] = 0.5 * (box.lo[a] + box.hi[a]);
+        eye[a] = centre[a] + (a == 1 ? 1.2 : 2.0) * (box.hi[a] - box.lo[a]);
+    }
+    std::vector<TrkRay> result;
+    for (int y = 0; y < kSide; ++y) {
+        for (int x = 0; x < kSide; ++x) {
+            const double target[3] = {
+                centre[0] + (static_cast<double>(x) / kSide - 0.5) * (box.hi[0] - box.lo[0]),
+                centre[1] + (static_cast<double>(y) / kSide - 0.5) * (box.hi[1] - box.lo[1]),
+                centre[2]};
+            TrkRay ray{};
+            for (int a = 0; a < 3; ++a) {
+                ray.origin[a] = static_cast<float>(eye[a]);
+                ray.direction[a] = static_cast<float>(target[a] - eye[a]);
+            }
+            ray.tMax = rays::kInfinity;
+            result.push_back(ray);
+        }
+    }
+    return result;
+}
+
+struct Set {
+    std::unique_ptr<track::Volume> volume;
+    std::vector<TrkRay> rays;
+    std::vector<float> exact;
+};
+
+TrkQuery singleThreaded(TrkMethod method) {
+    TrkQuery query = trkDefaultQuery();
+    query.method = method;
+    query.threads = 1;
+    return query;
+}
+
+/// The volume with super-voxels of `size`, scaled to a mean optical depth of the rays that hit.
+Set& makeSet(int size, int depth, bool coherent) {
+    static std::map<std::string, Set> sets;
+    const std::string key =
+        std::to_string(size) + "-" + std::to_string(depth) + (coherent ? "c" : "i");
+    Set& set = sets[key];
+    if (set.volume) {
+        return set;
+    }
+    const std::string vdb = volumeFile();
+    const std::string sidecar = fixtures::path("bench" + std::to_string(size) + ".track.vdb");
+    fixtures::bake(vdb, sidecar, size);
+    TrkVolumeOptions options = trkDefaultVolumeOptions();
+    const track::Volume unscaled = track::Volume::open(vdb, "", options);
+    const rays::Box box = rays::boundsOf(unscaled.info());
+    set.rays = coherent ? cameraRays(box) : rays::through(box, 16384, 0, 1);
+    const TrkQuery query = singleThreaded(TRK_METHOD_EXACT);
+    std::vector<double> depths(set.rays.size());
+    unscaled.integrateOpticalDepth(query, set.rays.data(), set.rays.size(), depths.data());
+    double sum = 0;
+    double hits = 0;
+    for (const double d : depths) {
+        sum += d;
+        hits += d > 0 ? 1 : 0;
+    }
+    options.scale = static_cast<float>(depth * hits / sum);
+    set.volume =
+        std::make_unique<track::Volume>(track::Volume::open(vdb, sidecar.c_str(), options));
+    set.exact.resize(set.rays.size());
+    set.volume->estimateTransmittance(query, set.rays.data(), set.rays.size(), set.exact.data());
+    return set;
+}
+
+void estimate(benchmark::State& state, TrkMethod method, int size, int depth, bool coherent) {
+    Set& set = makeSet(size, depth, coherent);
+    TrkQuery query = singleThreaded(method);
+    std::vector<float> out(set.rays.size());
+    std::vector<TrkStatistics> statistics(set.rays.size());
+    double squares = 0;
+    double lookups = 0;
+    for (auto ignored : state) {
+        ++query.seed;
+        set.volume->estimateTransmittance(query, set.rays.data(), set.rays.size(), out.data(),
+                                          statistics.data());
+        state.PauseTiming();
+        for (size_t i = 0; i < out.size(); ++i) {
+            const double error = static_cast<double>(out[i]) - static_cast<double>(set.exact[i]);
+            squares += error * error;
+            lookups += static_cast<double>(statistics[i].lookups);
+        }
+        state.ResumeTiming();
+    }
+    const double rays = static_cast<double>(set.rays.size() * state.iterations());
+    state.counters["s/ray"] =
+        benchmark::Counter(rays, benchmark::Counter::kIsRate | benchmark::Counter::kInvert);
+    state.counters["lookups"] = lookups / rays;
+    state.counters["mse"] = squares / rays;
+}
+
+void bakeStatistics(benchmark::State& state) {
+    const trk::Density density = fixtures::load(volumeFile());
+    for (auto ignored : state) {
+        benchmark::DoNotOptimize(
+            vdbtools::bake(density.field, static_cast<int>(state.range(0)), 4));
+    }
+}
+
+void loadDensity(benchmark::State& state) {
+    const std::string vdb = volumeFile();
+    for (auto ignored : state) {
+        benchmark::DoNotOptimize(fixtures::load(vdb));
+    }
+}
+
+}  // namespace
+
+int main(int argc, char** argv) {
+    const std::pair<const char*, TrkMethod> methods[] = {{"exact", TRK_METHOD_EXACT},
+                                                         {"residual", TRK_METHOD_RESIDUAL},
+                                                         {"ratio", TRK_METHOD_RATIO},
+                                                         {"control", TRK_METHOD_CONTROL}};
+    for (const bool coherent : {true, false}) {
+        for (const int depth : {1, 10}) {
+            for (const int size : {8, 16}) {
+                for (const auto& [name, method] : methods) {
+                    const std::string label = std::string(name) + "/size" + std::to_string(size) +
+                                              "/depth" + std::to_string(depth) +
+                                              (coherent ? "/camera" : "/inside");
+                    const TrkMethod m = method;
+                    benchmark::RegisterBenchmark(label.c_str(), [=](benchmark::State& state) {
+                        estimate(state, m, size, depth, coherent);
+                    })->Unit(benchmark::kMillisecond);
+                }
+            }
+        }
+    }
+    benchmark::RegisterBenchmark("load", loadDensity)->Unit(benchmark::kMillisecond);
+    benchmark::RegisterBenchmark("bake", bakeStatistics)
+        ->Arg(4)
+        ->Arg(16)
+        ->Unit(benchmark::kMillisecond);
+    benchmark::Initialize(&argc, argv);
+    benchmark::RunSpecifiedBenchmarks();
+    return 0;
+}

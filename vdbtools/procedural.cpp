@@ -22,6 +22,7 @@ namespace {
 using trk::Vec3d;
 
 constexpr double kBoxSize = 10;  // world units
+constexpr double kLeast = 1e-3;  // thinner than this is nothing, as simulations store it
 
 double smoothStep(double lo, double hi, double x) {
     const double t = std::min(std::max((x - lo) / (hi - lo), 0.0), 1.0);
@@ -206,13 +207,16 @@ class Smoke : public Shape {
         if (r > 1.3) {
             return 0;
         }
-        const Vec3d stretched{{9 * q[0], 4.5 * q[1], 9 * q[2]}};
-        const double sheets = noise_.billows(stretched + 0.5 * warp(stretched, 2), 5, 0.6);
-        const double wisps = smoothStep(0.42 + 0.22 * r + 0.14 * height, 0.95, sheets);
-        const double core = std::exp(-2.2 * r * r);
-        const double ends = smoothStep(0.05, 0.09, p[1]) * (1 - smoothStep(0.72, 0.95, p[1]));
-        const double thinning = 0.25 + 0.75 * std::exp(-2.5 * height);
-        return ends * thinning * core * wisps * (1 - smoothStep(1.0, 1.3, r));
+        // Thin folded sheets, where a warped noise crosses 0, in a faint haze; finer across the
+        // plume than along it.
+        const Vec3d stretched{{4.5 * q[0], 2.2 * q[1], 4.5 * q[2]}};
+        const Vec3d folded = stretched + 0.55 * warp(2.0 * stretched, 3);
+        const double crossing = std::fabs(noise_.octaves(folded, 3, 0.45));
+        const double sheet = 1 - smoothStep(0.0, 0.055 + 0.05 * height, crossing);
+        const double haze = smoothStep(0.35, 0.8, noise_.billows(3.0 * folded, 4, 0.5));
+        const double body = 1 - smoothStep(0.35, 1.25, r);
+        const double ends = smoothStep(0.05, 0.10, p[1]) * (1 - smoothStep(0.55, 0.95, p[1]));
+        return ends * body * (0.75 * sheet * (0.4 + 0.6 * haze) + 0.05 * haze);
     }
 
   private:
@@ -267,7 +271,7 @@ ProceduralSummary writeProcedural(const ProceduralOptions& options, const trk::O
                     const double d = shape->density(
                         {{(at.x() + 0.5) * voxel, (at.y() + 0.5) * voxel, (at.z() + 0.5) * voxel}});
                     const bool inside = std::max({at.x(), at.y(), at.z()}) < options.voxels;
-                    if (inside && d > 1e-4) {
+                    if (inside && d > kLeast) {
                         leaf->setValueOn(i, static_cast<float>(d));
                     }
                 }

@@ -44,7 +44,8 @@ std::string altered(const Baked& baked, const std::string& name,
     openvdb::io::File file(baked.sidecar);
     file.open();
     Grids grids;
-    for (const auto& grid : *file.getGrids()) {
+    const openvdb::GridPtrVecPtr read = file.getGrids();
+    for (const auto& grid : *read) {
         grids[grid->getName()] = grid;
     }
     change(grids);

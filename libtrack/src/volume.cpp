@@ -11,6 +11,10 @@
 #include <sstream>
 #include <utility>
 
+#if defined(__GLIBC__)
+#include <malloc.h>
+#endif
+
 namespace trk {
 namespace {
 
@@ -153,6 +157,11 @@ Volume openVolume(const char* vdbPath, const char* sidecarPath, const VolumeOpti
                                          volume.indexToWorld.longestDiagonal());
         volume.hasSuperVoxels = true;
     }
+#if defined(__GLIBC__)
+    // OpenVDB's trees are millions of small blocks: freed, they would stay with the process, about
+    // as much again as the volume holds.
+    malloc_trim(0);
+#endif
     checkMemory(volume.bytes(), options.maxMemory, vdbPath ? vdbPath : volume.sidecarPath);
     return volume;
 }

@@ -8,6 +8,7 @@
 #include <gtest/gtest.h>
 
 #include <cmath>
+#include <cstdio>
 #include <fstream>
 #include <string>
 
@@ -98,6 +99,23 @@ TEST(SparseVolumes, AHugeConstantTile) {
     EXPECT_LT(mean, 0.9);
     if (!kSanitized) {
         EXPECT_LT(peak, 64 * 1024);
+    }
+}
+
+TEST(SparseVolumes, AnOpenedCloudStaysNearItsGridInMemory) {
+    const std::string vdb = fixtures::cloudFile(256);
+    const uint64_t gridBytes = fixtures::load(vdb).summary.gridBytes;
+    // Threads, registries and caches first: they are not the volume's.
+    track::Volume::open(fixtures::cloudFile(64), "");
+    const long before = statusKilobytes("VmRSS");
+    const track::Volume volume = track::Volume::open(vdb, "");
+    const double resident = 1024.0 * static_cast<double>(statusKilobytes("VmRSS") - before);
+    std::printf("grid %.3g bytes, volume %.3g, resident %.3g: %.2f x the grid\n",
+                static_cast<double>(gridBytes), static_cast<double>(volume.info().bytes), resident,
+                resident / static_cast<double>(gridBytes));
+    EXPECT_LT(static_cast<double>(volume.info().bytes), 1.7 * static_cast<double>(gridBytes));
+    if (!kSanitized) {
+        EXPECT_LT(resident, 1.7 * static_cast<double>(gridBytes));
     }
 }
 

@@ -3,7 +3,6 @@
 #include "command_line.h"
 
 #include "bake.h"
-#include "error.h"
 #include "io/density.h"
 #include "io/sidecar.h"
 
@@ -40,10 +39,7 @@ void run(const Command& command, const std::vector<std::string>& given) {
     const int levels = arguments.integer("levels", 0, 8);
     const std::string output =
         arguments.has("output") ? arguments.text("output") : trk::defaultSidecarPath(input);
-    std::error_code ignored;
-    if (std::filesystem::equivalent(input, output, ignored)) {
-        throw trk::Error(TRK_ERROR_IO, output + ": is the input; expected another output");
-    }
+    refuseInput(output, {input});
 
     const auto start = std::chrono::steady_clock::now();
     const auto seconds = [&] {
@@ -84,7 +80,7 @@ void run(const Command& command, const std::vector<std::string>& given) {
         trk::writeSidecar(file, header, baked, summary.anchor);
         file.commit();
     }
-    if (baked.items.empty()) {
+    if (baked.items.empty() && !arguments.quiet()) {
         std::cerr << "vdbtrack: warning: " << input << ": grid " << summary.grid.name
                   << " is empty; its sidecar holds nothing and its transmittance is 1\n";
     }

@@ -1,12 +1,14 @@
 // SPDX-License-Identifier: Apache-2.0
 #include "command_line.h"
 
+#include "error.h"
+
 #include <tbb/global_control.h>
-#include <tbb/info.h>
 #include <unistd.h>
 
 #include <cmath>
 #include <cstdio>
+#include <filesystem>
 #include <iostream>
 #include <memory>
 #include <mutex>
@@ -61,10 +63,10 @@ Arguments::Arguments(const Command& command, const std::vector<std::string>& arg
             throw UsageError("missing argument " + positional[i]);
         }
     }
-    threads_ = integer("threads", 0, 4096);
-    if (threads_ > 0) {
+    const int threads = integer("threads", 0, 4096);
+    if (threads > 0) {
         threadLimit = std::make_unique<tbb::global_control>(
-            tbb::global_control::max_allowed_parallelism, static_cast<size_t>(threads_));
+            tbb::global_control::max_allowed_parallelism, static_cast<size_t>(threads));
     }
 }
 
@@ -75,6 +77,16 @@ int Arguments::integer(const std::string& name, int lo, int hi) const {
                          std::to_string(lo) + " to " + std::to_string(hi));
     }
     return value;
+}
+
+void refuseInput(const std::string& output, const std::vector<std::string>& inputs) {
+    for (const std::string& input : inputs) {
+        std::error_code ignored;
+        if (!output.empty() && !input.empty() &&
+            std::filesystem::equivalent(input, output, ignored)) {
+            throw trk::Error(TRK_ERROR_IO, output + ": is an input; expected another output");
+        }
+    }
 }
 
 void addGridOptions(po::options_description& options) {

@@ -49,20 +49,23 @@ class Arguments {
     const T& get(const std::string& name) const {
         return values_[name].as<T>();
     }
+    /// Whether the option was given, not only defaulted.
+    bool given(const std::string& name) const { return has(name) && !values_[name].defaulted(); }
     bool flag(const std::string& name) const { return has(name) && get<bool>(name); }
     std::string text(const std::string& name) const {
         return has(name) ? get<std::string>(name) : std::string();
     }
     bool quiet() const { return flag("quiet"); }
-    int threads() const { return threads_; }
 
     /// The integer value of an option that must lie in [lo, hi].
     int integer(const std::string& name, int lo, int hi) const;
 
   private:
     boost::program_options::variables_map values_;
-    int threads_ = 0;
 };
+
+/// Throws where an output file is one of the inputs; empty names are none.
+void refuseInput(const std::string& output, const std::vector<std::string>& inputs);
 
 /// Options of opening a volume that several commands share: --grid, --drop-nonfinite,
 /// --clamp-negative.

@@ -10,6 +10,7 @@
 #include <ImfStringAttribute.h>
 #include <png.h>
 
+#include <cerrno>
 #include <cmath>
 #include <cstdint>
 #include <cstdio>
@@ -43,6 +44,7 @@ uint8_t encodeSrgb(float linear) {
 
 void writeExr(const Image& image, const std::map<std::string, std::string>& attributes,
               const trk::OutputFile& file) {
+    errno = 0;
     try {
         Imf::Header header(image.width, image.height);
         Imf::FrameBuffer frame;
@@ -60,8 +62,8 @@ void writeExr(const Image& image, const std::map<std::string, std::string>& attr
         out.setFrameBuffer(frame);
         out.writePixels(image.height);
     } catch (const std::exception& e) {
-        const std::string text = e.what();
-        cannotWrite(file, text.substr(0, text.find('\n')));
+        // OpenEXR names the path it was given, which is not the user's.
+        cannotWrite(file, errno ? std::strerror(errno) : trk::firstLine(e));
     }
 }
 
@@ -80,8 +82,9 @@ void writePng(const Image& image, const trk::OutputFile& file) {
     png.width = static_cast<png_uint_32>(image.width);
     png.height = static_cast<png_uint_32>(image.height);
     png.format = PNG_FORMAT_RGB;
+    errno = 0;
     if (!png_image_write_to_file(&png, file.path().c_str(), 0, bytes.data(), 0, nullptr)) {
-        cannotWrite(file, png.message);
+        cannotWrite(file, errno ? std::strerror(errno) : png.message);
     }
 }
 

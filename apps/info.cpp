@@ -87,11 +87,7 @@ Json describeSidecar(const std::string& path) {
                           length(header.indexToWorld.column(1)),
                           length(header.indexToWorld.column(2))};
     addBounds(json, header.indexToWorld, sidecar.anchor, sidecar.baked.table.occupiedBox());
-    float max = 0;
-    for (const trk::BakedSuperVoxel& item : sidecar.baked.items) {
-        max = std::max(max, item.max);
-    }
-    json["max_density"] = max;
+    json["max_density"] = sidecar.baked.maxDensity();
     if (header.repair & TRK_REPAIR_DROP_NONFINITE) {
         json["dropped_nonfinite"] = header.dropped;
     }
@@ -109,6 +105,19 @@ std::string formatBounds(const Json& json) {
                   lo[0].get<double>(), lo[1].get<double>(), lo[2].get<double>(),
                   hi[0].get<double>(), hi[1].get<double>(), hi[2].get<double>());
     return text;
+}
+
+std::string formatRepairs(const Json& json) {
+    std::string text;
+    if (json.contains("dropped_nonfinite")) {
+        text += std::to_string(json["dropped_nonfinite"].get<uint64_t>()) +
+                " values that were not finite read as 0 ";
+    }
+    if (json.contains("clamped_negative")) {
+        text +=
+            std::to_string(json["clamped_negative"].get<uint64_t>()) + " negative values read as 0";
+    }
+    return text.empty() ? "nothing" : text;
 }
 
 /// 3 numbers as "a x b x c", or once where they agree.
@@ -153,7 +162,7 @@ void run(const Command& command, const std::vector<std::string>& given) {
     if (trk::isSidecar(path)) {
         const Json json = describeSidecar(path);
         if (arguments.flag("json")) {
-            std::cout << json.dump(2) << "\n";
+            std::cout << json.dump(2, ' ', false, Json::error_handler_t::replace) << "\n";
             return;
         }
         std::cout << path << ": sidecar of grid \"" << json["source_grid"].get<std::string>()
@@ -165,6 +174,7 @@ void run(const Command& command, const std::vector<std::string>& given) {
                   << "  voxel size    " << formatSize(json["voxel_size"]) << "\n"
                   << "  bounds        " << formatBounds(json) << "\n"
                   << "  density       up to " << json["max_density"].get<float>() << "\n"
+                  << "  repaired      " << formatRepairs(json) << "\n"
                   << "  baked by      vdbtrack " << json["tool_version"].get<std::string>() << "\n";
         return;
     }
@@ -177,7 +187,7 @@ void run(const Command& command, const std::vector<std::string>& given) {
         json["grids"].push_back(describeGrid(file, entry));
     }
     if (arguments.flag("json")) {
-        std::cout << json.dump(2) << "\n";
+        std::cout << json.dump(2, ' ', false, Json::error_handler_t::replace) << "\n";
         return;
     }
     std::cout << path << ": " << file.entries().size()

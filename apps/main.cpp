@@ -62,8 +62,11 @@ int run(const apps::Command& command, const std::vector<std::string>& arguments)
 
 int main(int argc, char** argv) {
     for (const int signal : {SIGINT, SIGTERM, SIGHUP}) {
-        std::signal(signal, endOnSignal);
+        if (std::signal(signal, endOnSignal) == SIG_IGN) {
+            std::signal(signal, SIG_IGN);  // as nohup asked
+        }
     }
+    std::signal(SIGXFSZ, SIG_IGN);  // a file size limit is an error of writing, with its message
     const std::vector<std::string> arguments(argv + 1, argv + argc);
     const std::string name = arguments.empty() ? "" : arguments[0];
     if (name == "--help" || name == "-h" || name == "help") {

@@ -201,6 +201,9 @@ void run(const Command& command, const std::vector<std::string>& given) {
     int height = 0;
     parseResolution(arguments.text("resolution"), width, height);
     choiceIndex("view", arguments.text("view"), kViews);
+    if (arguments.given("view") && arguments.has("camera")) {
+        throw UsageError("--view and --camera: expected one of them");
+    }
     const int level = arguments.integer("level", 0, 64);
     Camera camera = arguments.has("camera") ? explicitCamera(arguments.text("camera"))
                                             : standardView(arguments.text("view"));
@@ -214,6 +217,7 @@ void run(const Command& command, const std::vector<std::string>& given) {
         throw UsageError("-o " + output + ": expected a name that ends in .png or .exr");
     }
 
+    refuseInput(output, {sidecar});
     const track::Volume volume = track::Volume::open("", sidecar.c_str());
     const TrkVolumeInfo info = volume.info();
     if (!arguments.has("camera")) {
@@ -228,6 +232,7 @@ void run(const Command& command, const std::vector<std::string>& given) {
     if (!arguments.has("scale")) {
         scale = defaultScale(depth);
     }
+    const bool hits = std::any_of(depth.begin(), depth.end(), [](double d) { return d > 0; });
     const Image image = compose(depth, scale, width, height);
     std::ostringstream eye;
     eye << formatNumber(camera.eye[0]) << "," << formatNumber(camera.eye[1]) << ","
@@ -255,8 +260,8 @@ void run(const Command& command, const std::vector<std::string>& given) {
     file.commit();
     if (!arguments.quiet()) {
         std::cerr << output << ": " << width << "x" << height << ", scale " << formatNumber(scale)
-                  << (arguments.has("scale") ? "" : " (median transmittance 0.3)") << ", level "
-                  << level << "\n";
+                  << (hits && !arguments.has("scale") ? " (median transmittance 0.3)" : "")
+                  << (hits ? "" : " (the picture is empty)") << ", level " << level << "\n";
     }
 }
 

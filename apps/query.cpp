@@ -4,11 +4,15 @@
 
 #include "error.h"
 #include "io/output_file.h"
+#include "io/sidecar.h"
 #include "track/track.hpp"
 
+#include <cerrno>
 #include <charconv>
 #include <cmath>
 #include <cstdio>
+#include <cstring>
+#include <filesystem>
 #include <fstream>
 #include <iostream>
 #include <limits>
@@ -23,8 +27,8 @@ const std::vector<std::string> kMethods{"exact", "residual", "ratio", "control"}
 const std::vector<std::string> kChoices{"robust", "mean", "min", "max"};
 
 /// The numbers of one line, or none where a field is not a number.
-std::vector<float> parseFields(const std::string& line) {
-    std::vector<float> values;
+std::vector<double> parseFields(const std::string& line) {
+    std::vector<double> values;
     const char* at = line.data();
     const char* const end = at + line.size();
     const auto skipSpace = [&] {
@@ -37,7 +41,7 @@ std::vector<float> parseFields(const std::string& line) {
         if (at != end && *at == '+') {
             ++at;
         }
-        float value = 0;
+        double value = 0;
         const auto [next, error] = std::from_chars(at, end, value);
         if (error != std::errc()) {
             return {};
@@ -57,19 +61,22 @@ std::vector<float> parseFields(const std::string& line) {
 std::vector<TrkRay> readRays(const std::string& path) {
     std::ifstream stream(path);
     if (!stream) {
-        throw trk::Error(TRK_ERROR_IO, path + ": cannot be opened");
+        throw trk::Error(TRK_ERROR_IO, path + ": cannot be opened: " + std::strerror(errno));
     }
     std::vector<TrkRay> rays;
     std::string line;
     bool first = true;  // a header may stand before the first ray
     for (size_t number = 1; std::getline(stream, line); ++number) {
+        if (number == 1 && line.compare(0, 3, "\xef\xbb\xbf") == 0) {
+            line.erase(0, 3);  // a byte order mark, as spreadsheets write
+        }
         if (!line.empty() && line.back() == '\r') {
             line.pop_back();
         }
         if (line.find_first_not_of(" \t") == std::string::npos || line[0] == '#') {
             continue;
         }
-        const std::vector<float> v = parseFields(line);
+        const std::vector<double> v = parseFields(line);
         const bool letters = std::isalpha(static_cast<unsigned char>(line[0])) != 0 &&
                              line.find("inf") != 0 && line.find("nan") != 0;
         if (v.empty() && first && letters) {
@@ -84,11 +91,22 @@ std::vector<TrkRay> readRays(const std::string& path) {
                                  (v.empty() ? "\"" + line.substr(0, 60) + "\""
                                             : std::to_string(v.size()) + " numbers"));
         }
-        TrkRay ray{
-            {v[0], v[1], v[2]}, 0, {v[3], v[4], v[5]}, std::numeric_limits<float>::infinity()};
-        if (v.size() == 8) {
-            ray.tMin = v[6];
-            ray.tMax = v[7];
+        const auto narrow = [](double x) { return static_cast<float>(x); };
+        const TrkRay ray{{narrow(v[0]), narrow(v[1]), narrow(v[2])},
+                         v.size() == 8 ? narrow(v[6]) : 0,
+                         {narrow(v[3]), narrow(v[4]), narrow(v[5])},
+                         v.size() == 8 ? narrow(v[7]) : std::numeric_limits<float>::infinity()};
+        bool finite = !std::isnan(ray.tMin) && !std::isnan(ray.tMax);
+        bool zero = true;
+        for (int a = 0; a < 3; ++a) {
+            finite = finite && std::isfinite(ray.origin[a]) && std::isfinite(ray.direction[a]);
+            zero = zero && ray.direction[a] == 0;
+        }
+        if (!finite || zero) {
+            throw trk::Error(TRK_ERROR_INVALID_ARGUMENT,
+                             path + ": line " + std::to_string(number) +
+                                 ": expected a finite origin, a finite direction that is not zero "
+                                 "as a float, and limits that are not NaN");
         }
         rays.push_back(ray);
     }
@@ -149,11 +167,19 @@ void run(const Command& command, const std::vector<std::string>& given) {
     const std::string grid = arguments.text("grid");
     volumeOptions.gridName = arguments.has("grid") ? grid.c_str() : nullptr;
 
+    const std::string input = arguments.text("IN.vdb");
+    refuseInput(arguments.text("output"),
+                {input, arguments.text("rays"), arguments.text("sidecar")});
     const std::vector<TrkRay> rays = readRays(arguments.text("rays"));
     const std::string sidecar = arguments.text("sidecar");
-    // What needs no sidecar also must not fail over one that does not fit.
+    // What needs no sidecar also must not fail over one that does not fit; but if the bake was
+    // allowed to repair values, so is this.
     const bool useSidecar = query.method != TRK_METHOD_EXACT || arguments.has("sidecar");
-    const track::Volume volume = track::Volume::open(arguments.text("IN.vdb"),
+    const std::string beside = trk::defaultSidecarPath(input);
+    if (!useSidecar && std::filesystem::exists(beside) && trk::isSidecar(beside)) {
+        volumeOptions.repair |= trk::readSidecarHeader(beside).repair;
+    }
+    const track::Volume volume = track::Volume::open(input,
                                                      arguments.has("sidecar") ? sidecar.c_str()
                                                      : useSidecar             ? nullptr
                                                                               : "",

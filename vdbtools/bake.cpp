@@ -18,6 +18,7 @@ using trk::BakedSuperVoxel;
 using trk::BakedVolume;
 using trk::ExtinctionField;
 using trk::Int3;
+using trk::roundUp;
 using trk::ScalarTable;
 using trk::SparseTable;
 
@@ -79,11 +80,6 @@ Moments cubeMoments(const float* first, size_t size) {
     return m;
 }
 
-float roundUp(double value) {
-    const auto nearest = static_cast<float>(value);
-    return static_cast<double>(nearest) < value ? std::nextafter(nearest, kInfinity) : nearest;
-}
-
 class Baker {
   public:
     Baker(const ExtinctionField& field, int superVoxelSize)
@@ -120,7 +116,7 @@ class Baker {
             addJob,
             // The surface of a large tile repeats a handful of patterns of bricks.
             [&](const Int3& origin, int shift, SparseTable::Key& key) {
-                field_.table().appendKey(origin, shift, key);
+                return field_.table().appendKey(origin, shift, key);
             });
         std::vector<BakedSuperVoxel> results(jobs.size());
         tbb::parallel_for(tbb::blocked_range<size_t>(0, jobs.size(), 32),
@@ -274,7 +270,7 @@ ScalarTable nextLevel(const SparseTable& finer, const trk::IntBox& box, const Me
             return add(static_cast<float>(sum / 8));
         },
         [&](const Int3& origin, int regionShift, SparseTable::Key& key) {
-            finer.appendKey(origin, regionShift, key);
+            return finer.appendKey(origin, regionShift, key);
         });
     return level;
 }

@@ -1,7 +1,7 @@
 // SPDX-License-Identifier: Apache-2.0
 #include "procedural.h"
 
-#include "error.h"
+#include "io/vdb_writer.h"
 #include "math.h"
 
 #include <openvdb/openvdb.h>
@@ -12,7 +12,6 @@
 #include <array>
 #include <atomic>
 #include <cmath>
-#include <fstream>
 #include <memory>
 #include <random>
 
@@ -295,14 +294,9 @@ ProceduralSummary writeProcedural(const ProceduralOptions& options, const trk::O
     grid->setName("density");
     grid->setGridClass(openvdb::GRID_FOG_VOLUME);
     grid->setTransform(openvdb::math::Transform::createLinearTransform(summary.voxelSize));
-    openvdb::MetaMap metadata;
-    metadata.insertMeta("creator", openvdb::StringMetadata("vdbtrack " TRACK_VERSION));
-    try {
-        openvdb::io::File out(file.path());
-        out.write(openvdb::GridCPtrVec{grid}, metadata);
-    } catch (const std::exception& e) {
-        throw trk::Error(TRK_ERROR_IO, file.target() + ": cannot be written: " + e.what());
-    }
+    trk::VdbWriter writer(file, 1);
+    writer.add(grid);
+    writer.finish();
     return summary;
 }
 

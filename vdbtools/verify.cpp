@@ -165,12 +165,17 @@ class Verifier {
         const IntBox closed{
             place.origin,
             {{place.origin[0] + edge + 1, place.origin[1] + edge + 1, place.origin[2] + edge + 1}}};
-        forEachRegion(regions, place.origin, place.shift + 1, closed,
-                      [&](const Int3& at, float value) {
-                          ++vertices;
-                          wrong = checkVertex(item, place, at, value);
-                          return wrong.empty();
-                      });
+        // The place itself and the seven regions that its upper faces belong to.
+        for (int corner = 0; corner < 8 && wrong.empty(); ++corner) {
+            const Int3 origin{{place.origin[0] + (corner & 4 ? edge : 0),
+                               place.origin[1] + (corner & 2 ? edge : 0),
+                               place.origin[2] + (corner & 1 ? edge : 0)}};
+            forEachRegion(regions, origin, place.shift, closed, [&](const Int3& at, float value) {
+                ++vertices;
+                wrong = checkVertex(item, place, at, value);
+                return wrong.empty();
+            });
+        }
         return wrong;
     }
 

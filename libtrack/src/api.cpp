@@ -8,6 +8,7 @@
 
 #include <tbb/task_arena.h>
 
+#include <algorithm>
 #include <cmath>
 #include <cstring>
 #include <exception>
@@ -59,7 +60,7 @@ TrkStatus guard(const Body& body) noexcept {
 void checkSize(const char* what, size_t size, size_t expected) {
     if (size != expected) {
         refuse(std::string(what) + ".size is " + std::to_string(size) + "; expected " +
-               std::to_string(expected) + " (fill the struct with its trkDefault… function)");
+               std::to_string(expected) + ", its sizeof (the trkDefault… functions set it)");
     }
 }
 
@@ -191,7 +192,8 @@ TrkStatus trkOpenVolume(const char* vdbPath, const char* sidecarPath,
         if (given.threads == 0) {
             tbb::this_task_arena::isolate(open);
         } else {
-            tbb::task_arena(given.threads).execute(open);
+            const int most = tbb::this_task_arena::max_concurrency();
+            tbb::task_arena(std::min(given.threads, most)).execute(open);
         }
     });
 }

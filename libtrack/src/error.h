@@ -19,4 +19,10 @@ class Error : public std::runtime_error {
     TrkStatus status_;
 };
 
+/// First line of an exception's message: errors are one line.
+inline std::string firstLine(const std::exception& e) {
+    const std::string text = e.what();
+    return text.substr(0, text.find('\n'));
+}
+
 }  // namespace trk

@@ -7,6 +7,7 @@
 #include <array>
 #include <cmath>
 #include <cstdint>
+#include <limits>
 
 namespace trk {
 
@@ -52,6 +53,14 @@ struct IntBox {
         }
     }
 };
+
+/// The smallest float that is not below `value`.
+inline float roundUp(double value) {
+    const auto nearest = static_cast<float>(value);
+    return static_cast<double>(nearest) < value
+               ? std::nextafter(nearest, std::numeric_limits<float>::infinity())
+               : nearest;
+}
 
 /// x -> linear x + translation, from index space to world space. `linear[row][column]`.
 struct AffineMap {

@@ -19,7 +19,7 @@ class Rng {
         return mix(state_);
     }
 
-    /// Exponentially distributed with mean 1; never 0 / 0 and at most 23.
+    /// Exponentially distributed with mean 1; from 0 to 23.
     double exponential() {
         const auto u = (static_cast<float>(next() >> 32) + 0.5f) * 0x1p-32f;  // (0, 1]
         return static_cast<double>(-std::log(u));

@@ -73,7 +73,7 @@ class SparseTable {
         return root_.capacity() * sizeof(Entry) + nodes_.capacity() * sizeof(Node);
     }
 
-    /// What the contents of a region follow from; equal keys, equal contents. Empty: nothing known.
+    /// What the contents of a region follow from; equal keys, equal contents.
     using Key = std::vector<Entry>;
 
     /// Fills the table top down. `uniform(origin, shift)` answers for the region of 2^shift voxels:
@@ -92,14 +92,15 @@ class SparseTable {
     }
     template <class Uniform, class Item>
     void fill(Uniform&& uniform, Item&& item) {
-        fill(uniform, item, [](const Int3&, int, Key&) {});
+        fill(uniform, item, [](const Int3&, int, Key&) { return false; });
     }
 
-    /// Appends what this table holds in a region: a key for tables derived from it.
-    void appendKey(const Int3& origin, int shift, Key& key) const {
+    /// Appends what this table holds in a region: a key for tables derived from it. False where
+    /// that would be too long to be worth it; the key is then incomplete.
+    bool appendKey(const Int3& origin, int shift, Key& key) const {
         if (root_.empty()) {
             key.push_back(kEmpty);
-            return;
+            return true;
         }
         int part = itemShift_;
         while (part + 3 <= std::min(shift, rootShift_)) {
@@ -107,7 +108,7 @@ class SparseTable {
         }
         const int64_t count = int64_t{1} << std::max(shift - part, 0);
         if (count > 8) {
-            return;
+            return false;
         }
         for (int64_t i = 0; i < count * count * count; ++i) {
             const Int3 at{{origin[0] + ((i / (count * count)) << part),
@@ -121,6 +122,7 @@ class SparseTable {
                                                  (at[2] & mask)));
             }
         }
+        return true;
     }
 
     /// The entry of a node with these children: the children's own where they are all one tile or
@@ -267,6 +269,9 @@ class SparseTable {
     /// The one entry that stands for everywhere in the region of 2^shift voxels at `origin`, if
     /// any. Items that fill the region count too.
     std::optional<Entry> uniformEntry(const Int3& origin, int shift) const {
+        if (root_.empty()) {
+            return kEmpty;
+        }
         const Found found = find(origin[0], origin[1], origin[2]);
         if (found.shift >= shift) {
             return found.entry;
@@ -325,8 +330,8 @@ class SparseTable {
             return *entry;
         }
         Key key;
-        keyOf(origin, shift, key);
-        if (!key.empty()) {
+        const bool known = keyOf(origin, shift, key);
+        if (known) {
             key.push_back(static_cast<Entry>(shift));
             if (const auto it = memo.find(key); it != memo.end()) {
                 return it->second;
@@ -343,7 +348,7 @@ class SparseTable {
             }
             entry = addNode(node);
         }
-        if (!key.empty()) {
+        if (known) {
             memo.emplace(std::move(key), entry);
         }
         return entry;

@@ -1,21 +1,9 @@
 // SPDX-License-Identifier: Apache-2.0
 #include "super_voxels.h"
 
-#include <limits>
 #include <utility>
 
 namespace trk {
-namespace {
-
-float roundUp(double value) {
-    const auto nearest = static_cast<float>(value);
-    return static_cast<double>(nearest) < value
-               ? std::nextafter(nearest, std::numeric_limits<float>::infinity())
-               : nearest;
-}
-
-}  // namespace
-
 double SuperVoxels::chooseControl(TrkChoice choice, double min, double mean, double max,
                                   double diagonal) {
     switch (choice) {

@@ -5,6 +5,7 @@
 #include "sparse_table.h"
 #include "track/track.h"
 
+#include <algorithm>
 #include <cstddef>
 #include <cstdint>
 #include <vector>
@@ -36,6 +37,13 @@ struct BakedVolume {
     std::vector<ScalarTable> levels;  ///< means of super-voxels 2, 4, … times as large
 
     int superVoxelSize() const { return 1 << superVoxelShift; }
+    float maxDensity() const {
+        float max = 0;
+        for (const BakedSuperVoxel& item : items) {
+            max = std::max(max, item.max);
+        }
+        return max;
+    }
 };
 
 /// What a query needs of one super-voxel, in extinction (1/world unit).

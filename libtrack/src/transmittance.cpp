@@ -10,6 +10,7 @@
 #include <tbb/parallel_for.h>
 #include <tbb/task_arena.h>
 
+#include <algorithm>
 #include <cmath>
 #include <limits>
 #include <string>
@@ -178,7 +179,9 @@ void forEachRay(const TrkQuery& query, size_t rayCount, const Body& body) {
     if (query.threads == 0) {
         run();
     } else {
-        tbb::task_arena(query.threads).execute(run);
+        // More than the machine has would only make TBB print a warning.
+        const int most = tbb::this_task_arena::max_concurrency();
+        tbb::task_arena(std::min(query.threads, most)).execute(run);
     }
 }
 

@@ -38,14 +38,6 @@ void checkMemory(uint64_t wanted, uint64_t cap, const std::string& path) {
     }
 }
 
-float maxDensity(const BakedVolume& baked) {
-    float max = 0;
-    for (const BakedSuperVoxel& item : baked.items) {
-        max = std::max(max, item.max);
-    }
-    return max;
-}
-
 }  // namespace
 
 bool Volume::clip(const TrkRay& ray, const IntBox& box, LocalRay& local,
@@ -152,7 +144,7 @@ Volume openVolume(const char* vdbPath, const char* sidecarPath, const VolumeOpti
     }
     volume.worldToIndex = volume.indexToWorld.inverse();
     if (haveSidecar) {
-        checkScale(options.scale, maxDensity(sidecar.baked), volume.sidecarPath);
+        checkScale(options.scale, sidecar.baked.maxDensity(), volume.sidecarPath);
         volume.superVoxels = SuperVoxels(std::move(sidecar.baked), options.scale, options.choice,
                                          volume.indexToWorld.longestDiagonal());
         volume.hasSuperVoxels = true;

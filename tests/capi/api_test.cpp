@@ -364,6 +364,20 @@ TEST(Api, ConcurrentQueriesAgree) {
     }
 }
 
+TEST(Api, AnyNumberOfThreadsIsAllowed) {
+    TrkVolumeOptions options = trkDefaultVolumeOptions();
+    options.threads = 1000000;
+    const track::Volume volume = track::Volume::open(files().vdb, "", options);
+    TrkQuery query = trkDefaultQuery();
+    query.method = TRK_METHOD_EXACT;
+    query.threads = 1000000;
+    const std::vector<TrkRay> all = cloudRays(volume, 100);
+    std::vector<float> out(all.size());
+    testing::internal::CaptureStderr();
+    volume.estimateTransmittance(query, all.data(), all.size(), out.data());
+    EXPECT_EQ(testing::internal::GetCapturedStderr(), "");
+}
+
 TEST(Api, ErrorsBelongToTheirThread) {
     TrkVolume* volume = nullptr;
     trkOpenVolume("/first", "", nullptr, &volume);

@@ -203,8 +203,13 @@ case_bad_rays() {
     bad 'a,b,c,d,e,f\nx,0,0,1,0,0\n' "line 2"
     bad '0,0,0,1,0,0,5\n' "found 7 numbers"
     bad '0,0,0,1,0,zero\n' "line 1"
-    bad '0,0,0,1,0,0\n\n# fine\n0,0,0,0,0,0\n' "ray 1"
-    bad 'nan,0,0,1,0,0\n' "ray 0"
+    bad '0,0,0,1,0,0\n\n# fine\n0,0,0,0,0,0\n' "line 4: expected a finite origin"
+    bad 'nan,0,0,1,0,0\n' "line 1: expected a finite origin"
+    bad '0,0,0,1e39,0,0\n' "line 1: expected a finite origin"
+    printf '0,5,5,1,0,1e-50\n' >tiny.csv
+    expect 0 query cloud.vdb --rays tiny.csv
+    expect 1 query cloud.vdb --rays tiny.csv -o tiny.csv --force
+    one_line "is an input"
     printf '0,0,0,1,0,0\r\n 0 , 0,0, +1,0,0 \r\n' >crlf.csv
     expect 0 query cloud.vdb --rays crlf.csv
     [ "$(wc -l <stdout)" = 3 ] || fail "CRLF and spaces"
@@ -257,7 +262,7 @@ case_outputs() {
     cmp -s cloud.track.vdb before.track.vdb || fail "refused, yet changed"
     expect 0 bake cloud.vdb --force
     expect 1 bake cloud.vdb -o cloud.vdb --force
-    one_line "is the input"
+    one_line "is an input"
     expect 1 bake cloud.vdb -o no/such/folder.vdb
     one_line "no/such/folder.vdb"
     expect 1 make cloud.vdb
@@ -268,6 +273,9 @@ case_outputs() {
     mkdir folder
     expect 1 bake cloud.vdb -o folder
     one_line "is a directory"
+    mkfifo pipe
+    expect 1 bake cloud.vdb -o pipe --force
+    one_line "is a device or pipe"
     if [ "$(id -u)" -ne 0 ]; then
         chmod a-w folder
         expect 1 bake cloud.vdb -o folder/x.vdb
@@ -297,13 +305,22 @@ case_full_disk() {
     ) || fail "bake on a full disk: $(cat stderr)"
     one_line "full.track.vdb: cannot be written"
     absent full.track.vdb
+    (
+        ulimit -f 8
+        trap '' XFSZ
+        "$vdbtrack" make full.vdb --voxels 64 >stdout 2>stderr
+        [ $? = 1 ] || exit 1
+    ) || fail "make on a full disk: $(cat stderr)"
+    one_line "full.vdb: cannot be written"
+    absent full.vdb
 }
 
 case_signals() {
     "$vdbtrack" make old.vdb --voxels 16 -q
     cp old.vdb copy.vdb
     for signal in INT TERM; do
-        "$vdbtrack" make old.vdb --voxels 512 --force -q &
+        # A shell's background jobs ignore SIGINT, and so would the program.
+        env --default-signal=INT,TERM "$vdbtrack" make old.vdb --voxels 512 --force -q &
         pid=$!
         sleep 0.3
         kill -$signal $pid 2>/dev/null || fail "too fast to be interrupted"
@@ -313,6 +330,11 @@ case_signals() {
         cmp -s old.vdb copy.vdb || fail "the old file changed"
     done
     [ "$(find . -name 'old*' | wc -l)" = 1 ] || fail "left behind: $(ls)"
+    (trap '' HUP; exec "$vdbtrack" make nohup.vdb --voxels 128 -q) &
+    pid=$!
+    sleep 0.1
+    kill -HUP $pid 2>/dev/null
+    wait $pid || fail "a program started by nohup ended on SIGHUP"
 }
 
 case_two_bakes_at_once() {

@@ -226,6 +226,71 @@ TEST(Sidecar, RefusesImplausibleBounds) {
     expectRefused(baked, hole, TRK_ERROR_BAD_FILE, "not active in the same");
 }
 
+TEST(Sidecar, LevelsOfFarPartsAreReadWhole) {
+    // Roots of a level's tree are larger than the anchor's step: regions straddle them.
+    auto grid = fixtures::makeGrid(openvdb::CoordBBox(0, 0, 0, 19, 19, 19),
+                                   [](const Coord&) { return 1.0f; });
+    auto far = openvdb::FloatGrid::create();
+    for (const int offset : {262300, 3200000}) {
+        for (auto it = grid->cbeginValueOn(); it; ++it) {
+            far->tree().setValue(it.getCoord() + Coord(offset), *it);
+        }
+    }
+    far->setName("density");
+    const std::string vdb = fixtures::write("far-levels.vdb", {far});
+    const trk::Density density = fixtures::load(vdb);
+    for (const int size : {4, 16, 64}) {
+        const std::string sidecar = fixtures::path("far-levels.track.vdb");
+        fixtures::bake(vdb, sidecar, size, 8);
+        const trk::BakedVolume baked = vdbtools::bake(density.field, size, 8);
+        const trk::Sidecar read = trk::readSidecar(sidecar, &density.summary, TRK_CHECK_FULL);
+        EXPECT_EQ(read.baked.table.occupiedItems(), baked.table.occupiedItems());
+        for (size_t level = 0; level < 8; ++level) {
+            EXPECT_EQ(read.baked.levels[level].table.occupiedItems(),
+                      baked.levels[level].table.occupiedItems())
+                << "size " << size << " level " << level + 1;
+        }
+    }
+}
+
+TEST(Sidecar, RefusesGridsThatCoverDifferentBoxes) {
+    const Baked baked = makeBaked("boxes");
+    const std::string empty = altered(baked, "box-empty.vdb", [&](Grids& grids) {
+        floatGrid(grids, "density_rms").tree().clear();
+        floatGrid(grids, "density_control").tree().setValue(Coord(1000000), 1.0f);
+    });
+    expectRefused(baked, empty, TRK_ERROR_BAD_FILE, "");
+}
+
+TEST(Verify, FindsAMissingHaloAroundATile) {
+    openvdb::initialize();
+    auto grid = openvdb::FloatGrid::create();
+    grid->setName("density");
+    grid->tree().addTile(2, Coord(0, 0, 0), 1.0f, true);
+    const std::string vdb = fixtures::write("halo.vdb", {grid});
+    const trk::Density density = fixtures::load(vdb);
+    // A bake that takes the tile for constant up to its faces, where the field ramps down.
+    trk::Sidecar wrong;
+    wrong.anchor = density.summary.anchor;
+    wrong.baked.superVoxelShift = 3;
+    const int64_t lo = -density.summary.anchor[0];
+    wrong.baked.table =
+        trk::SparseTable(3, {{{lo - 8, lo - 8, lo - 8}}, {{lo + 128, lo + 128, lo + 128}}});
+    wrong.baked.table.fill([](const trk::Int3&, int) { return std::nullopt; },
+                           [](const trk::Int3&) { return 1u; });
+    wrong.baked.items.push_back({1, 1, 1, 0, 0});
+    EXPECT_NE(vdbtools::verify(density.summary, wrong).counterexample, "");
+    wrong.baked.table = trk::SparseTable(3, {{{lo, lo, lo}}, {{lo + 128, lo + 128, lo + 128}}});
+    wrong.baked.table.fill(
+        [&](const trk::Int3& at, int) -> std::optional<trk::SparseTable::Entry> {
+            const bool in = at[0] >= lo && at[1] >= lo && at[2] >= lo;
+            return in ? 1u : 0u;
+        },
+        [](const trk::Int3&) { return 1u; });
+    EXPECT_NE(vdbtools::verify(density.summary, wrong).counterexample.find("min 1"),
+              std::string::npos);
+}
+
 TEST(Verify, ProvesAGoodBakeAndFindsEveryLie) {
     const Baked baked = makeBaked("verify", 8);
     trk::Sidecar sidecar = trk::readSidecar(baked.sidecar, &baked.density.summary, TRK_CHECK_FULL);

@@ -52,6 +52,13 @@ const VdbEntry& choose(VdbFile& file, const DensityOptions& options) {
     if (candidates.empty() && file.entries().size() == 1) {
         return file.entries()[0];  // whose refusal says more than a list of one
     }
+    for (const VdbEntry& entry : file.entries()) {
+        const openvdb::GridBase::Ptr grid = file.readMetadata(entry);
+        if (grid && (*grid)["track_format"]) {
+            throw Error(TRK_ERROR_GRID_NOT_FOUND,
+                        file.path() + ": is a sidecar; expected the density it was baked from");
+        }
+    }
     throw Error(TRK_ERROR_GRID_NOT_FOUND,
                 file.path() +
                     (candidates.empty() ? ": no grid can be a density"
@@ -95,7 +102,7 @@ void checkValues(const TreeScan& scan, double background, uint32_t repair,
         throw Error(TRK_ERROR_BAD_DENSITY, line.str());
     };
     if (scan.nonfinite.count > 0 && !(repair & TRK_REPAIR_DROP_NONFINITE)) {
-        refuse(scan.nonfinite, "NaN or infinite", "--drop-nonfinite");
+        refuse(scan.nonfinite, "NaN or infinite as float", "--drop-nonfinite");
     }
     if (scan.negative.count > 0 && !(repair & TRK_REPAIR_CLAMP_NEGATIVE)) {
         refuse(scan.negative, "negative", "--clamp-negative");

@@ -28,7 +28,7 @@ struct DensitySummary {
     uint64_t digest = 0;  ///< of origins, levels, masks and values as stored, before any repair
     uint64_t activeVoxels = 0;
     uint64_t gridBytes = 0;  ///< what OpenVDB held for the grid
-    float min = 0;           ///< smallest and largest value that is not background
+    float min = 0;           ///< smallest and largest value in leaves and tiles
     float max = 0;
     uint32_t repair = 0;  ///< the repairs allowed
     uint64_t dropped = 0;

@@ -41,10 +41,22 @@ void cleanUpOutputFiles() {
 }
 
 OutputFile::OutputFile(std::string target, bool force) : target_(std::move(target)), force_(force) {
-    struct stat info {};
-    if (stat(target_.c_str(), &info) == 0) {
+    if (target_.empty()) {
+        throw Error(TRK_ERROR_IO, "the output has no name");
+    }
+    struct stat info = {};
+    const bool replaces = stat(target_.c_str(), &info) == 0;
+    if (replaces) {
+        if (std::filesystem::is_symlink(target_)) {  // replace what it points to, not the link
+            target_ = std::filesystem::canonical(target_).string();
+        }
         if (S_ISDIR(info.st_mode)) {
             throw Error(TRK_ERROR_IO, target_ + ": is a directory; expected a file name");
+        }
+        if (!S_ISREG(info.st_mode)) {
+            throw Error(
+                TRK_ERROR_IO,
+                target_ + ": is a device or pipe, which would be replaced; expected a file");
         }
         if (!force_) {
             throw Error(TRK_ERROR_IO, target_ + ": exists already; --force replaces it");
@@ -57,20 +69,18 @@ OutputFile::OutputFile(std::string target, bool force) : target_(std::move(targe
     descriptor_ = open(folder.c_str(), O_TMPFILE | O_WRONLY | O_CLOEXEC, 0666);
     if (descriptor_ >= 0) {
         path_ = "/proc/self/fd/" + std::to_string(descriptor_);
-        return;
-    }
-    if (errno != EOPNOTSUPP && errno != EISDIR && errno != EINVAL) {
+    } else if (errno != EOPNOTSUPP && errno != EISDIR && errno != EINVAL) {
         fail(target_, "cannot be written", errno);
+    } else {
+        makeTemporaryName([&](const char* name) {
+            descriptor_ = open(name, O_CREAT | O_EXCL | O_WRONLY | O_CLOEXEC, 0666);
+            return descriptor_ >= 0;
+        });
+        path_ = temporaryName_;
     }
-    temporaryName_ = target_ + ".tmp" + std::to_string(getpid());
-    descriptor_ = open(temporaryName_.c_str(), O_CREAT | O_EXCL | O_WRONLY | O_CLOEXEC, 0666);
-    if (descriptor_ < 0) {
-        const int error = errno;
-        temporaryName_.clear();
-        fail(target_, "cannot be written", error);
+    if (replaces && fchmod(descriptor_, info.st_mode & 07777) != 0) {
+        fail(target_, "cannot keep its permissions", errno);
     }
-    rememberTemporary(temporaryName_);
-    path_ = temporaryName_;
 }
 
 OutputFile::~OutputFile() {
@@ -83,32 +93,55 @@ OutputFile::~OutputFile() {
     }
 }
 
+void OutputFile::makeTemporaryName(const std::function<bool(const char*)>& create) {
+    for (int attempt = 0;; ++attempt) {  // a killed process of the same number may have left one
+        const std::string name =
+            target_ + ".tmp" + std::to_string(getpid()) + "-" + std::to_string(attempt);
+        if (create(name.c_str())) {
+            temporaryName_ = name;
+            rememberTemporary(name);
+            return;
+        }
+        if (errno != EEXIST || attempt > 1000) {
+            fail(target_, "cannot be written", errno);
+        }
+    }
+}
+
 void OutputFile::commit() {
     if (fsync(descriptor_) != 0) {
         fail(target_, "cannot be flushed to disk", errno);
     }
-    if (!force_) {
-        // A hard link never replaces: of two writers, one fails.
-        if (linkat(AT_FDCWD, path_.c_str(), AT_FDCWD, target_.c_str(), AT_SYMLINK_FOLLOW) != 0) {
-            if (errno == EEXIST) {
-                throw Error(
-                    TRK_ERROR_IO,
-                    target_ + ": was written by somebody else meanwhile; --force replaces it");
-            }
-            fail(target_, "cannot be written", errno);
+    const auto linkTo = [&](const char* name) {
+        return linkat(AT_FDCWD, path_.c_str(), AT_FDCWD, name, AT_SYMLINK_FOLLOW) == 0;
+    };
+    const auto failIfTaken = [&] {
+        if (errno == EEXIST) {
+            throw Error(TRK_ERROR_IO,
+                        target_ + ": was written by somebody else meanwhile; --force replaces it");
         }
-        return;
-    }
+    };
     if (temporaryName_.empty()) {
-        const std::string name = target_ + ".tmp" + std::to_string(getpid());
-        rememberTemporary(name);
-        if (linkat(AT_FDCWD, path_.c_str(), AT_FDCWD, name.c_str(), AT_SYMLINK_FOLLOW) != 0) {
-            fail(target_, "cannot be written", errno);
+        if (!force_ && linkTo(target_.c_str())) {  // never replaces: of two writers, one fails
+            return;
         }
-        temporaryName_ = name;
+        if (!force_) {
+            failIfTaken();
+        }
+        makeTemporaryName(linkTo);
+    }
+    if (!force_) {
+        if (renameat2(AT_FDCWD, temporaryName_.c_str(), AT_FDCWD, target_.c_str(),
+                      RENAME_NOREPLACE) == 0) {
+            haveTemporaryPath = false;
+            temporaryName_.clear();
+            return;
+        }
+        failIfTaken();
+        // A file system that cannot do either: the check of the constructor must do.
     }
     if (rename(temporaryName_.c_str(), target_.c_str()) != 0) {
-        fail(target_, "cannot be replaced", errno);
+        fail(target_, force_ ? "cannot be replaced" : "cannot be written", errno);
     }
     haveTemporaryPath = false;
     temporaryName_.clear();

@@ -2,6 +2,7 @@
 // Files that appear whole or not at all.
 #pragma once
 
+#include <functional>
 #include <string>
 
 namespace trk {
@@ -26,6 +27,9 @@ class OutputFile {
     void commit();
 
   private:
+    /// Finds a free name beside the target; `create(name)` answers whether it made that file.
+    void makeTemporaryName(const std::function<bool(const char*)>& create);
+
     std::string target_;
     std::string path_;
     std::string temporaryName_;  // empty while the file has none

@@ -5,10 +5,8 @@
 #include "../hash.h"
 #include "tree_regions.h"
 #include "vdb_file.h"
+#include "vdb_writer.h"
 
-#include <openvdb/io/Archive.h>
-#include <openvdb/io/GridDescriptor.h>
-#include <openvdb/io/io.h>
 #include <openvdb/tools/Prune.h>
 
 #include <algorithm>
@@ -17,8 +15,6 @@
 #include <cstdio>
 #include <cstdlib>
 #include <cstring>
-#include <filesystem>
-#include <fstream>
 #include <functional>
 #include <unordered_map>
 #include <utility>
@@ -106,28 +102,6 @@ bool sameMap(const AffineMap& a, const AffineMap& b) {
 }
 
 // ---- Writing ------------------------------------------------------------------------------------
-
-/// OpenVDB's own writer wants all grids at once; this one makes them one by one.
-class SidecarArchive : public openvdb::io::Archive {
-  public:
-    SidecarArchive(std::ostream& stream, int32_t gridCount) : stream_(stream) {
-        openvdb::io::setDataCompression(stream_, compression());
-        openvdb::io::setWriteGridStatsMetadata(stream_, isGridStatsMetadataEnabled());
-        writeHeader(stream_, /*seekable=*/true);
-        openvdb::MetaMap fileMetadata;
-        fileMetadata.insertMeta("creator", openvdb::StringMetadata("vdbtrack " TRACK_VERSION));
-        fileMetadata.writeMeta(stream_);
-        stream_.write(reinterpret_cast<const char*>(&gridCount), sizeof(gridCount));
-    }
-    void add(const openvdb::GridBase::Ptr& grid) {
-        openvdb::io::GridDescriptor descriptor(grid->getName(), grid->type());
-        writeGrid(descriptor, grid, stream_, /*seekable=*/true);
-        openvdb::io::setDataCompression(stream_, compression());
-    }
-
-  private:
-    std::ostream& stream_;
-};
 
 void addMetadata(openvdb::GridBase& grid, const SidecarHeader& header) {
     const auto text = [&](const char* name, const std::string& value) {
@@ -270,8 +244,8 @@ SidecarHeader readHeader(VdbFile& file) {
         badSidecar(where, "super-voxel size " + std::to_string(size) +
                               "; expected a power of two from 4 to 64");
     }
-    if (header.levels < 0 || header.levels > 16) {
-        badSidecar(where, std::to_string(header.levels) + " levels; expected 0 to 16");
+    if (header.levels < 0 || header.levels > 8) {
+        badSidecar(where, std::to_string(header.levels) + " levels; expected 0 to 8");
     }
     const std::string interpolation = metaText(*grid, "track_interpolation", where);
     if (header.controlKind != "constant" || interpolation != kInterpolation) {
@@ -360,16 +334,23 @@ class SidecarReader {
         std::vector<ScalarTable> tables;
         for (const Statistic& statistic : kStatistics) {
             const auto grid = readGrid(prefix + statistic.suffix, shift);
+            const IntBox support = supportBox(grid->tree(), shift);
             if (tables.empty()) {
-                box_ = supportBox(grid->tree(), shift);
+                box_ = support;
                 sidecar.anchor = anchor ? *anchor : anchorFor(box_);
             }
+            if (support.lo != box_.lo || support.hi != box_.hi) {
+                badSidecar(file_.path(), "grid " + grid->getName() + " covers another box than " +
+                                             prefix + kStatistics[0].suffix);
+            }
+            checkAnchor(support, sidecar.anchor, grid->getName());
             tables.push_back(makeTable(*grid, shift, sidecar.anchor));
         }
         join(tables, sidecar);
         tables.clear();
         for (int level = 1; level <= header_.levels; ++level) {
             const auto grid = readGrid(prefix + levelSuffix(level), shift + level);
+            checkAnchor(supportBox(grid->tree(), shift + level), sidecar.anchor, grid->getName());
             baked.levels.push_back(makeTable(*grid, shift + level, sidecar.anchor));
         }
     }
@@ -424,9 +405,9 @@ class SidecarReader {
             },
             [](const Int3&) { return SparseTable::kEmpty; },  // a super-voxel is always uniform
             [&](const Int3& local, int shift, SparseTable::Key& key) {
-                for (const ScalarTable& table : tables) {
-                    table.table.appendKey(local, shift, key);
-                }
+                return std::all_of(tables.begin(), tables.end(), [&](const ScalarTable& table) {
+                    return table.table.appendKey(local, shift, key);
+                });
             });
     }
 
@@ -434,6 +415,16 @@ class SidecarReader {
     static Int3 superVoxel(const Int3& local, int shift, const Int3& anchor) {
         return {{(anchor[0] + local[0]) >> shift, (anchor[1] + local[1]) >> shift,
                  (anchor[2] + local[2]) >> shift}};
+    }
+
+    /// Local space has no negative coordinates; a grid that would need them belongs to another
+    /// density.
+    void checkAnchor(const IntBox& support, const Int3& anchor, const std::string& name) const {
+        for (size_t a = 0; a < 3 && !support.empty(); ++a) {
+            if (support.lo[a] < anchor[a]) {
+                badSidecar(file_.path(), "grid " + name + " reaches outside the density's box");
+            }
+        }
     }
 
     static IntBox toLocal(IntBox box, const Int3& anchor) {
@@ -586,27 +577,18 @@ Sidecar readSidecar(const std::string& path, const DensitySummary* density, TrkC
 void writeSidecar(const OutputFile& file, const SidecarHeader& header, const BakedVolume& baked,
                   const Int3& anchor) {
     openvdb::initialize();
-    try {
-        std::ofstream stream;
-        stream.exceptions(std::ios::badbit | std::ios::failbit);
-        stream.open(file.path(), std::ios::binary);
-        const auto levels = static_cast<int32_t>(baked.levels.size());
-        SidecarArchive archive(stream, static_cast<int32_t>(std::size(kStatistics)) + levels);
-        for (const Statistic& statistic : kStatistics) {
-            archive.add(makeGrid(header, baked.table, anchor, statistic.suffix,
-                                 [&](size_t i) { return baked.items[i].*statistic.value; }));
-        }
-        for (int32_t level = 1; level <= levels; ++level) {
-            const ScalarTable& preview = baked.levels[static_cast<size_t>(level) - 1];
-            archive.add(makeGrid(header, preview.table, anchor, levelSuffix(level),
-                                 [&](size_t i) { return preview.values[i]; }));
-        }
-        stream.close();
-    } catch (const std::ios_base::failure&) {
-        throw Error(TRK_ERROR_IO, file.target() + ": cannot be written (disk full?)");
-    } catch (const openvdb::Exception& e) {
-        throw Error(TRK_ERROR_IO, file.target() + ": cannot be written: " + e.what());
+    const auto levels = static_cast<int32_t>(baked.levels.size());
+    VdbWriter writer(file, static_cast<int32_t>(std::size(kStatistics)) + levels);
+    for (const Statistic& statistic : kStatistics) {
+        writer.add(makeGrid(header, baked.table, anchor, statistic.suffix,
+                            [&](size_t i) { return baked.items[i].*statistic.value; }));
     }
+    for (int32_t level = 1; level <= levels; ++level) {
+        const ScalarTable& means = baked.levels[static_cast<size_t>(level) - 1];
+        writer.add(makeGrid(header, means.table, anchor, levelSuffix(level),
+                            [&](size_t i) { return means.values[i]; }));
+    }
+    writer.finish();
 }
 
 }  // namespace trk

@@ -46,19 +46,28 @@ class TreeRegions {
         return inRange(at) ? accessor_.getValue(coord(at)) : tree_.background();
     }
 
-    /// Value and state of the aligned region of 2^shift voxels at `origin`, if no node divides it
-    /// into different ones. A leaf counts as divided.
+    /// Value and state of the region of 2^shift voxels at `origin`, if it is known to be the same
+    /// everywhere: no node divides it into different ones. A leaf counts as divided, and so does a
+    /// region that is not aligned with the tree's nodes; a single voxel never is.
     std::optional<Region> uniform(const Int3& origin, int shift) {
         const Region nothing{tree_.background(), false};
-        if (shift > kUpperShift) {  // may hold several of the root's regions: uniform only if empty
+        if (shift > kUpperShift) {  // may meet several of the root's regions: uniform only if empty
             const int64_t size = int64_t{1} << shift;
-            for (const Int3& o : rootOrigins_) {
-                if (o[0] >= origin[0] && o[0] < origin[0] + size && o[1] >= origin[1] &&
-                    o[1] < origin[1] + size && o[2] >= origin[2] && o[2] < origin[2] + size) {
-                    return std::nullopt;
+            const int64_t rootSize = int64_t{1} << kUpperShift;
+            const auto meets = [&](const Int3& o) {
+                bool result = true;
+                for (size_t a = 0; a < 3; ++a) {
+                    result = result && o[a] < origin[a] + size && o[a] + rootSize > origin[a];
                 }
-            }
-            return nothing;
+                return result;
+            };
+            return std::any_of(rootOrigins_.begin(), rootOrigins_.end(), meets)
+                       ? std::nullopt
+                       : std::optional<Region>(nothing);
+        }
+        const int64_t mask = (int64_t{1} << shift) - 1;
+        if (((origin[0] | origin[1] | origin[2]) & mask) != 0) {
+            return std::nullopt;
         }
         if (!inRange(origin)) {  // all of it is, as the limits are multiples of 4096
             return nothing;

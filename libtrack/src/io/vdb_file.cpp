@@ -2,6 +2,7 @@
 #include "vdb_file.h"
 
 #include "../error.h"
+#include "guarded_stream.h"
 
 #include <openvdb/io/Archive.h>
 #include <openvdb/io/GridDescriptor.h>
@@ -10,7 +11,7 @@
 #include <cerrno>
 #include <cstring>
 #include <filesystem>
-#include <fstream>
+#include <istream>
 #include <map>
 #include <utility>
 
@@ -19,12 +20,6 @@ namespace {
 
 [[noreturn]] void badFile(const std::string& where, const std::string& what) {
     throw Error(TRK_ERROR_BAD_FILE, where + ": " + what);
-}
-
-/// First line of an exception's message: errors are one line.
-std::string firstLine(const std::exception& e) {
-    const std::string text = e.what();
-    return text.substr(0, text.find('\n'));
 }
 
 /// Runs a reading step and says in one line what broke it.
@@ -90,8 +85,7 @@ class VdbFile::Archive : public openvdb::io::Archive {
             throw Error(TRK_ERROR_IO, path + ": is a directory; expected a .vdb file");
         }
         errno = 0;
-        stream_.open(path, std::ios::binary);
-        if (!stream_) {
+        if (!buffer_.open(path, std::ios::in | std::ios::binary)) {
             throw Error(TRK_ERROR_IO, path + ": cannot be opened: " + std::strerror(errno));
         }
     }
@@ -112,11 +106,13 @@ class VdbFile::Archive : public openvdb::io::Archive {
             if (inputHasGridOffsets()) {
                 int64_t offsets[3];  // grid, blocks, end
                 stream_.read(reinterpret_cast<char*>(offsets), sizeof(offsets));
-                entry.position = offsets[0];
-                stream_.seekg(offsets[2]);
-                if (offsets[2] < offsets[0]) {
+                // Each entry must lie behind the last, or a damaged directory could go round for
+                // ever.
+                if (offsets[0] < static_cast<int64_t>(stream_.tellg()) || offsets[2] < offsets[0]) {
                     badFile(path, "damaged: grid " + entry.name + " ends before it begins");
                 }
+                entry.position = offsets[0];
+                stream_.seekg(offsets[2]);
             } else {
                 int64_t offsets[3];
                 stream_.read(reinterpret_cast<char*>(offsets), sizeof(offsets));
@@ -142,6 +138,10 @@ class VdbFile::Archive : public openvdb::io::Archive {
         stream_.seekg(entry.position);
         tagStream(entry.half);
         readGridCompression(stream_);
+        const uint32_t compression = openvdb::io::getDataCompression(stream_);
+        buffer_.beginGrid(storedValueSize(entry),
+                          (compression & openvdb::io::COMPRESS_ACTIVE_MASK) != 0,
+                          (compression & openvdb::io::COMPRESS_BLOSC) != 0);
         openvdb::io::setGridClass(stream_, openvdb::GRID_UNKNOWN);
         openvdb::io::setGridBackgroundValuePtr(stream_, nullptr);
         grid->readMeta(stream_);
@@ -231,12 +231,30 @@ class VdbFile::Archive : public openvdb::io::Archive {
         return entry;
     }
 
-    std::ifstream stream_;
+    /// Bytes of a value in the file, for the types whose voxels are read; else 0.
+    size_t storedValueSize(const VdbEntry& entry) const {
+        if (fileVersion() < openvdb::OPENVDB_FILE_VERSION_NODE_MASK_COMPRESSION) {
+            return 0;
+        }
+        const bool isFloat = entry.type == openvdb::FloatTree::treeType();
+        const bool isDouble = entry.type == openvdb::DoubleTree::treeType();
+        if (!isFloat && !isDouble) {
+            return 0;
+        }
+        return entry.half ? 2 : isFloat ? sizeof(float) : sizeof(double);
+    }
+
+    GuardedFileBuf buffer_;
+    std::istream stream_{&buffer_};
     openvdb::io::StreamMetadata::Ptr metadata_;
 };
 
 std::string VdbEntry::label() const {
-    return name.empty() || equalNames > 1 ? name + "[" + std::to_string(index) + "]" : name;
+    std::string text = name;
+    for (char& c : text) {  // damaged files have names that would break the one line of an error
+        c = static_cast<unsigned char>(c) < ' ' || c == 0x7f ? '?' : c;
+    }
+    return name.empty() || equalNames > 1 ? text + "[" + std::to_string(index) + "]" : text;
 }
 
 VdbFile::VdbFile(const std::string& path) : path_(path) {

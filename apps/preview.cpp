@@ -115,7 +115,7 @@ std::string formatNumber(double value) {
 
 /// Optical depth of the baked control per pixel, at scale 1.
 std::vector<double> renderDepth(const track::Volume& volume, const Camera& camera, int width,
-                                int height, uint32_t level, Progress& progress) {
+                                int height, uint32_t level, Progress* progress) {
     TrkQuery query = trkDefaultQuery();
     query.method = TRK_METHOD_CONTROL;
     query.level = level;
@@ -137,9 +137,31 @@ std::vector<double> renderDepth(const track::Volume& volume, const Camera& camer
         }
         volume.integrateOpticalDepth(query, rays.data(), rays.size(),
                                      &depth[static_cast<size_t>(row) * static_cast<size_t>(width)]);
-        progress.update((row + 1.0) / height);
+        if (progress) {
+            progress->update((row + 1.0) / height);
+        }
     }
     return depth;
+}
+
+/// Narrows the field of view until what a small picture shows of the volume fills the frame: boxes
+/// are mostly empty at their corners.
+void zoom(Camera& camera, const track::Volume& volume, double aspect, uint32_t level) {
+    constexpr int kHeight = 96;
+    const int width = std::max(1, static_cast<int>(std::min(kHeight * aspect, 2048.0)));
+    const std::vector<double> depth = renderDepth(volume, camera, width, kHeight, level, nullptr);
+    double reach = 0;
+    for (size_t i = 0; i < depth.size(); ++i) {
+        if (depth[i] > 0) {
+            const auto column = static_cast<double>(i % static_cast<size_t>(width));
+            const auto row = static_cast<double>(i / static_cast<size_t>(width));
+            reach = std::max({reach, std::fabs(2 * (column + 0.5) / width - 1) + 1.0 / width,
+                              std::fabs(2 * (row + 0.5) / kHeight - 1) + 1.0 / kHeight});
+        }
+    }
+    if (reach > 0) {
+        camera.tangent *= std::min(1.0, 1.04 * reach);
+    }
 }
 
 /// The scale at which the median transmittance of the pixels that meet anything is 0.3.
@@ -221,13 +243,15 @@ void run(const Command& command, const std::vector<std::string>& given) {
     const track::Volume volume = track::Volume::open("", sidecar.c_str());
     const TrkVolumeInfo info = volume.info();
     if (!arguments.has("camera")) {
-        frame(camera, info, static_cast<double>(width) / height);
+        const double aspect = static_cast<double>(width) / height;
+        frame(camera, info, aspect);
+        zoom(camera, volume, aspect, static_cast<uint32_t>(level));
     }
     trk::OutputFile file(output, arguments.flag("force"));
     std::vector<double> depth;
     {
         Progress progress(arguments, "drawing " + output);
-        depth = renderDepth(volume, camera, width, height, static_cast<uint32_t>(level), progress);
+        depth = renderDepth(volume, camera, width, height, static_cast<uint32_t>(level), &progress);
     }
     if (!arguments.has("scale")) {
         scale = defaultScale(depth);

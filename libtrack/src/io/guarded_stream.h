@@ -6,8 +6,10 @@
 #include <bitset>
 #include <cstddef>
 #include <cstdint>
+#include <cstdlib>
 #include <cstring>
 #include <fstream>
+#include <limits>
 #include <stdexcept>
 #include <string>
 
@@ -20,59 +22,67 @@ namespace trk {
 /// size) and lets the chunk pass only if it has the size that mask and byte announce.
 class GuardedFileBuf : public std::filebuf {
   public:
-    /// Before each grid. `valueSize`: bytes of a value in the file, 0 where that is not known, and
-    /// nothing is guarded. `maskCompressed`: whether inactive values are left out. `blosc`: whether
-    /// chunks are compressed by Blosc.
-    void beginGrid(size_t valueSize, bool maskCompressed, bool blosc) {
+    enum class Codec { kUnguarded, kZip, kBlosc };
+
+    /// Before each grid. `codec`: of its chunks; kUnguarded where they have no size before them, or
+    /// are not of floats or doubles. `valueSize`: bytes of a value in the file. `maskCompressed`:
+    /// whether inactive values are left out.
+    void beginGrid(Codec codec, size_t valueSize, bool maskCompressed) {
+        codec_ = codec;
         valueSize_ = valueSize;
         maskCompressed_ = maskCompressed;
-        blosc_ = blosc;
-        expected_ = rawSize_ = bloscSize_ = kNothing;
+        afterMask_ = false;
+        expected_ = chunkSize_ = kNothing;
     }
 
   protected:
     std::streamsize xsgetn(char* out, std::streamsize size) override {
-        if (expected_ != kNothing && rawSize_ != kNothing && size == rawSize_) {
-            const std::streamsize expected = expected_;
-            expected_ = kNothing;
-            if (size != expected) {
-                throw std::runtime_error("a chunk of " + std::to_string(size) +
-                                         " bytes, expected " + std::to_string(expected));
-            }
+        if (codec_ == Codec::kUnguarded) {
+            return std::filebuf::xsgetn(out, size);
         }
-        const bool blosc = blosc_ && expected_ != kNothing && size == bloscSize_;
+        const bool isChunk = chunkSize_ != kNothing && size == std::abs(chunkSize_);
+        if (isChunk && chunkSize_ < 0 && size != expected_) {
+            refuse(size);
+        }
         const std::streamsize got = std::filebuf::xsgetn(out, size);
-        if (blosc && got == size) {
-            checkBloscHeader(out, size);
-        }
         if (got == size) {
-            follow(out, size);
+            if (!isChunk) {
+                follow(out, size);
+            } else {
+                if (chunkSize_ > 0 && codec_ == Codec::kBlosc) {
+                    checkBloscHeader(out, size);
+                }
+                expected_ = chunkSize_ = kNothing;
+            }
         }
         return got;
     }
 
   private:
-    static constexpr std::streamsize kNothing = -1;
+    static constexpr std::streamsize kNothing = std::numeric_limits<std::streamsize>::min();
     static constexpr char kAllValues = 6;  // OpenVDB's NO_MASK_AND_ALL_VALS
 
+    [[noreturn]] void refuse(std::streamsize size) const {
+        throw std::runtime_error("a chunk of " + std::to_string(size) + " bytes for values of " +
+                                 std::to_string(expected_));
+    }
+
     /// A Blosc chunk begins with its sizes, which its decoder believes.
-    void checkBloscHeader(const char* bytes, std::streamsize size) {
+    void checkBloscHeader(const char* bytes, std::streamsize size) const {
         uint32_t sizes[3] = {0, 0, 0};  // uncompressed, of a block, compressed
         if (size >= 16) {
             std::memcpy(sizes, bytes + 4, sizeof(sizes));
         }
-        const std::streamsize expected = expected_;
-        expected_ = kNothing;
-        const bool blocks = expected == 0 || (sizes[1] > 0 && sizes[1] <= sizes[0]);
-        if (sizes[0] != expected || sizes[2] != size || !blocks) {
-            throw std::runtime_error("a Blosc chunk that does not hold the " +
-                                     std::to_string(expected) + " bytes announced");
+        const bool blocks = expected_ == 0 || (sizes[1] > 0 && sizes[1] <= sizes[0]);
+        if (sizes[0] != expected_ || sizes[2] != size || !blocks) {
+            refuse(size);
         }
     }
 
     void follow(const char* bytes, std::streamsize size) {
-        rawSize_ = bloscSize_ = kNothing;
-        if (size == 64 || size == 512 || size == 4096) {  // the masks of the three kinds of nodes
+        const bool isMask =
+            size == 64 || size == 512 || size == 4096;  // of the three kinds of nodes
+        if (isMask && expected_ == kNothing) {
             active_ = 0;
             for (std::streamsize i = 0; i < size; ++i) {
                 active_ += std::bitset<8>(static_cast<unsigned char>(bytes[i])).count();
@@ -81,27 +91,35 @@ class GuardedFileBuf : public std::filebuf {
             afterMask_ = true;
             return;
         }
-        if (size == 1 && afterMask_ && valueSize_ > 0) {
+        if (size == 1 && afterMask_) {
             const bool everything = !maskCompressed_ || bytes[0] == kAllValues;
             expected_ = static_cast<std::streamsize>((everything ? all_ : active_) * valueSize_);
-        } else if (size == 8) {
+            if (expected_ == 0 && valueSize_ == 2) {  // no halfs, no chunk; no floats, an empty one
+                expected_ = kNothing;
+            }
+        } else if (size == 8 && expected_ != kNothing) {
             int64_t chunkSize;
             std::memcpy(&chunkSize, bytes, sizeof(chunkSize));
-            rawSize_ = chunkSize < 0 ? -chunkSize : kNothing;
-            bloscSize_ = chunkSize > 0 ? chunkSize : kNothing;
+            // (Before a chunk of doubles, eight bytes may also be an inactive value.)
+            if (valueSize_ < sizeof(double) && chunkSize > expected_ + expected_ / 8 + 1024) {
+                refuse(chunkSize);
+            }
+            chunkSize_ = chunkSize;
+            if (chunkSize == 0) {
+                expected_ = chunkSize_ = kNothing;
+            }
         }
         afterMask_ = false;
     }
 
+    Codec codec_ = Codec::kUnguarded;
     size_t valueSize_ = 0;
     bool maskCompressed_ = false;
-    bool blosc_ = false;
     bool afterMask_ = false;
     size_t active_ = 0;  // values of the last mask, and all that it has room for
     size_t all_ = 0;
-    std::streamsize expected_ = kNothing;   // bytes of the chunk to come, if it is not compressed
-    std::streamsize rawSize_ = kNothing;    // bytes the last read says it has, not compressed
-    std::streamsize bloscSize_ = kNothing;  // or compressed
+    std::streamsize expected_ = kNothing;   // bytes that the chunk to come must turn into
+    std::streamsize chunkSize_ = kNothing;  // its bytes in the file; negative if not compressed
 };
 
 }  // namespace trk

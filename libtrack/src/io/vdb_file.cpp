@@ -138,10 +138,7 @@ class VdbFile::Archive : public openvdb::io::Archive {
         stream_.seekg(entry.position);
         tagStream(entry.half);
         readGridCompression(stream_);
-        const uint32_t compression = openvdb::io::getDataCompression(stream_);
-        buffer_.beginGrid(storedValueSize(entry),
-                          (compression & openvdb::io::COMPRESS_ACTIVE_MASK) != 0,
-                          (compression & openvdb::io::COMPRESS_BLOSC) != 0);
+        guard(entry);
         openvdb::io::setGridClass(stream_, openvdb::GRID_UNKNOWN);
         openvdb::io::setGridBackgroundValuePtr(stream_, nullptr);
         grid->readMeta(stream_);
@@ -231,17 +228,24 @@ class VdbFile::Archive : public openvdb::io::Archive {
         return entry;
     }
 
-    /// Bytes of a value in the file, for the types whose voxels are read; else 0.
-    size_t storedValueSize(const VdbEntry& entry) const {
-        if (fileVersion() < openvdb::OPENVDB_FILE_VERSION_NODE_MASK_COMPRESSION) {
-            return 0;
-        }
+    /// Has the stream watch over the chunks of a grid, where it knows what they look like.
+    void guard(const VdbEntry& entry) {
+        using Codec = GuardedFileBuf::Codec;
         const bool isFloat = entry.type == openvdb::FloatTree::treeType();
         const bool isDouble = entry.type == openvdb::DoubleTree::treeType();
-        if (!isFloat && !isDouble) {
-            return 0;
+        const uint32_t flags = openvdb::io::getDataCompression(stream_);
+        Codec codec = flags & openvdb::io::COMPRESS_BLOSC ? Codec::kBlosc
+                      : flags & openvdb::io::COMPRESS_ZIP ? Codec::kZip
+                                                          : Codec::kUnguarded;
+        if (fileVersion() < openvdb::OPENVDB_FILE_VERSION_NODE_MASK_COMPRESSION ||
+            !(isFloat || isDouble)) {
+            codec = Codec::kUnguarded;
         }
-        return entry.half ? 2 : isFloat ? sizeof(float) : sizeof(double);
+        buffer_.beginGrid(codec,
+                          entry.half ? 2
+                          : isFloat  ? sizeof(float)
+                                     : sizeof(double),
+                          (flags & openvdb::io::COMPRESS_ACTIVE_MASK) != 0);
     }
 
     GuardedFileBuf buffer_;

@@ -3,171 +3,24 @@
 
 #include "../error.h"
 #include "../hash.h"
+#include "sidecar_schema.h"
 #include "tree_regions.h"
 #include "vdb_file.h"
-#include "vdb_writer.h"
-
-#include <openvdb/tools/Prune.h>
 
 #include <algorithm>
 #include <array>
 #include <cmath>
 #include <cstdio>
 #include <cstdlib>
-#include <cstring>
-#include <functional>
 #include <unordered_map>
 #include <utility>
 #include <vector>
 
 namespace trk {
+
+using namespace schema;
+
 namespace {
-
-constexpr int kFormatMajor = 1;
-constexpr const char* kFormat = "1.0";
-constexpr const char* kInterpolation = "trilinear";
-
-/// The grids of statistics, in the order written, and where their values live.
-struct Statistic {
-    const char* suffix;
-    float BakedSuperVoxel::*value;
-};
-constexpr Statistic kStatistics[] = {
-    {"_control", &BakedSuperVoxel::control}, {"_majorant", &BakedSuperVoxel::majorant},
-    {"_rms", &BakedSuperVoxel::rms},         {"_min", &BakedSuperVoxel::min},
-    {"_max", &BakedSuperVoxel::max},
-};
-
-std::string gridPrefix(const std::string& source) {
-    return source.empty() ? "density" : source;
-}
-
-std::string levelSuffix(int level) {
-    return "_control_level_" + std::to_string(level);
-}
-
-std::string hexDigest(uint64_t digest) {
-    char text[17];
-    std::snprintf(text, sizeof(text), "%016llx", static_cast<unsigned long long>(digest));
-    return text;
-}
-
-/// Index i of a grid of super-voxels of `size` lies at source index size i + size / 2.
-AffineMap superVoxelMap(const AffineMap& source, int size) {
-    AffineMap map = source;
-    const double centre = size / 2.0;
-    const Vec3d shift = source.vector({{centre, centre, centre}});
-    for (int row = 0; row < 3; ++row) {
-        for (int column = 0; column < 3; ++column) {
-            map.linear[row][column] *= size;
-        }
-        map.translation[row] += shift[row];
-    }
-    return map;
-}
-
-AffineMap sourceMap(const AffineMap& superVoxels, int size) {
-    AffineMap map = superVoxels;
-    for (auto& row : map.linear) {
-        for (double& value : row) {
-            value /= size;
-        }
-    }
-    const double centre = size / 2.0;
-    const Vec3d shift = map.vector({{centre, centre, centre}});
-    for (int row = 0; row < 3; ++row) {
-        map.translation[row] -= shift[row];
-    }
-    return map;
-}
-
-/// Equal up to the rounding of a few operations, measured where the volume is.
-bool sameMap(const AffineMap& a, const AffineMap& b) {
-    for (int row = 0; row < 3; ++row) {
-        double size = 0;
-        for (int column = 0; column < 3; ++column) {
-            size = std::max(size, std::fabs(a.linear[row][column]));
-        }
-        for (int column = 0; column < 3; ++column) {
-            if (std::fabs(a.linear[row][column] - b.linear[row][column]) > 1e-9 * size) {
-                return false;
-            }
-        }
-        const double offset = std::fabs(a.translation[row]);
-        if (std::fabs(a.translation[row] - b.translation[row]) > 1e-6 * size + 1e-12 * offset) {
-            return false;
-        }
-    }
-    return true;
-}
-
-// ---- Writing ------------------------------------------------------------------------------------
-
-void addMetadata(openvdb::GridBase& grid, const SidecarHeader& header) {
-    const auto text = [&](const char* name, const std::string& value) {
-        grid.insertMeta(name, openvdb::StringMetadata(value));
-    };
-    const auto number = [&](const char* name, int32_t value) {
-        grid.insertMeta(name, openvdb::Int32Metadata(value));
-    };
-    text("track_format", kFormat);
-    text("track_tool_version", header.toolVersion);
-    text("track_source_file", header.sourceFile);
-    text("track_source_grid", header.source.name);
-    number("track_source_index", header.source.index);
-    text("track_source_digest", hexDigest(header.digest));
-    number("track_super_voxel_size", header.superVoxelSize);
-    text("track_control", header.controlKind);
-    text("track_interpolation", kInterpolation);
-    number("track_levels", header.levels);
-    if (header.repair & TRK_REPAIR_DROP_NONFINITE) {
-        grid.insertMeta("track_dropped_nonfinite",
-                        openvdb::Int64Metadata(static_cast<int64_t>(header.dropped)));
-    }
-    if (header.repair & TRK_REPAIR_CLAMP_NEGATIVE) {
-        grid.insertMeta("track_clamped_negative",
-                        openvdb::Int64Metadata(static_cast<int64_t>(header.clamped)));
-    }
-}
-
-template <class GridType>
-openvdb::GridBase::Ptr makeGrid(const SparseTable& table, const Int3& anchor,
-                                const std::function<float(size_t)>& valueOf) {
-    using Value = typename GridType::ValueType;
-    auto grid = GridType::create();
-    auto accessor = grid->getAccessor();
-    const int itemShift = table.itemShift();
-    table.forEach([&](const Int3& lo, int shift, SparseTable::Entry entry) {
-        Int3 at;
-        for (size_t a = 0; a < 3; ++a) {
-            at[a] = (anchor[a] + lo[a]) >> itemShift;
-        }
-        const auto value = static_cast<Value>(valueOf(entry - 1));
-        if (shift == itemShift) {
-            accessor.setValueOn(toCoord(at), value);
-            return;
-        }
-        const int32_t size = 1 << (shift - itemShift);
-        grid->sparseFill(openvdb::CoordBBox::createCube(toCoord(at), size), value, true);
-    });
-    openvdb::tools::prune(grid->tree());
-    return grid;
-}
-
-openvdb::GridBase::Ptr makeGrid(const SidecarHeader& header, const SparseTable& table,
-                                const Int3& anchor, const std::string& suffix,
-                                const std::function<float(size_t)>& valueOf) {
-    openvdb::GridBase::Ptr grid = header.valueType == "double"
-                                      ? makeGrid<openvdb::DoubleGrid>(table, anchor, valueOf)
-                                      : makeGrid<openvdb::FloatGrid>(table, anchor, valueOf);
-    grid->setName(gridPrefix(header.source.name) + suffix);
-    grid->setGridClass(openvdb::GRID_FOG_VOLUME);
-    grid->setTransform(makeTransform(superVoxelMap(header.indexToWorld, 1 << table.itemShift())));
-    addMetadata(*grid, header);
-    return grid;
-}
-
-// ---- Reading ------------------------------------------------------------------------------------
 
 [[noreturn]] void badSidecar(const std::string& where, const std::string& what) {
     throw Error(TRK_ERROR_BAD_FILE, where + ": " + what);
@@ -572,23 +425,6 @@ Sidecar readSidecar(const std::string& path, const DensitySummary* density, TrkC
         SidecarReader<openvdb::FloatTree>(file, sidecar.header, check).read(anchor, sidecar);
     }
     return sidecar;
-}
-
-void writeSidecar(const OutputFile& file, const SidecarHeader& header, const BakedVolume& baked,
-                  const Int3& anchor) {
-    openvdb::initialize();
-    const auto levels = static_cast<int32_t>(baked.levels.size());
-    VdbWriter writer(file, static_cast<int32_t>(std::size(kStatistics)) + levels);
-    for (const Statistic& statistic : kStatistics) {
-        writer.add(makeGrid(header, baked.table, anchor, statistic.suffix,
-                            [&](size_t i) { return baked.items[i].*statistic.value; }));
-    }
-    for (int32_t level = 1; level <= levels; ++level) {
-        const ScalarTable& means = baked.levels[static_cast<size_t>(level) - 1];
-        writer.add(makeGrid(header, means.table, anchor, levelSuffix(level),
-                            [&](size_t i) { return means.values[i]; }));
-    }
-    writer.finish();
 }
 
 }  // namespace trk

@@ -1,0 +1,314 @@
+// SPDX-License-Identifier: Apache-2.0
+// Sets of rays whose estimates are fit for a z-test: exact moments, tails, standard errors.
+#pragma once
+
+#include "estimators/ratio_tracking.h"
+#include "rng.h"
+#include "support/rays.h"
+#include "support/reference.h"
+#include "volume.h"
+
+#include <gtest/gtest.h>
+
+#include <algorithm>
+#include <cmath>
+#include <cstdint>
+#include <random>
+#include <string>
+#include <vector>
+
+namespace estimates {
+
+using trk::LocalRay;
+
+/// One way of estimating: a method and, for residual, its control.
+struct Variant {
+    std::string name;
+    bool residual;
+    TrkChoice choice;
+};
+inline const std::vector<Variant> kVariants{{"ratio", false, TRK_CHOICE_ROBUST},
+                                            {"residual robust", true, TRK_CHOICE_ROBUST},
+                                            {"residual mean", true, TRK_CHOICE_MEAN},
+                                            {"residual min", true, TRK_CHOICE_MIN},
+                                            {"residual max", true, TRK_CHOICE_MAX}};
+
+/// z beyond which one of `comparisons` true hypotheses falls with probability 0.01 [Sidak 1967].
+inline double sidakBound(size_t comparisons) {
+    const double alpha = 1 - std::pow(0.99, 1.0 / static_cast<double>(comparisons));
+    double lo = 0;
+    double hi = 20;
+    for (int i = 0; i < 100; ++i) {
+        const double middle = 0.5 * (lo + hi);
+        (std::erfc(middle / std::sqrt(2.0)) > alpha ? lo : hi) = middle;
+    }
+    return lo;
+}
+
+struct PreparedRay {
+    LocalRay local;
+    double lengthPerVoxel;
+    double exactDepth;  ///< true optical depth
+};
+
+/// An opened volume at a scale where the rays that hit have a given mean optical depth.
+struct Scene {
+    trk::Volume volume;
+    std::vector<PreparedRay> rays;
+
+    Scene(const std::string& vdb, const std::string& sidecar, const Variant& variant,
+          double meanDepth, size_t count) {
+        trk::VolumeOptions options;
+        options.choice = variant.choice;
+        const trk::Volume unscaled = trk::openVolume(vdb.c_str(), "", options);
+        rays = prepare(unscaled, count);
+        double sum = 0;
+        for (const PreparedRay& ray : rays) {
+            sum += ray.exactDepth;
+        }
+        options.scale = static_cast<float>(meanDepth * static_cast<double>(rays.size()) / sum);
+        volume = trk::openVolume(vdb.c_str(), sidecar.c_str(), options);
+        rays = prepare(volume, count);
+    }
+
+    static std::vector<PreparedRay> prepare(const trk::Volume& volume, size_t count) {
+        rays::Box box{};
+        for (int a = 0; a < 3; ++a) {
+            const auto axis = static_cast<size_t>(a);
+            box.lo[a] = 0.2 * static_cast<double>(volume.field.box().hi[axis]) +
+                        0.8 * static_cast<double>(volume.field.box().lo[axis]);
+            box.hi[a] = 0.8 * static_cast<double>(volume.field.box().hi[axis]) +
+                        0.2 * static_cast<double>(volume.field.box().lo[axis]);
+        }
+        std::vector<PreparedRay> result;
+        std::mt19937_64 random(99);
+        std::uniform_real_distribution<double> unit(0, 1);
+        while (result.size() < count) {
+            const auto d = rays::unitVector(random);
+            trk::Vec3d index;
+            trk::Vec3d direction{{d[0], d[1], d[2]}};
+            for (int a = 0; a < 3; ++a) {
+                index[a] = box.lo[a] + unit(random) * (box.hi[a] - box.lo[a]) -
+                           1000 * d[static_cast<size_t>(a)] +
+                           static_cast<double>(volume.anchor[static_cast<size_t>(a)]);
+            }
+            const trk::Vec3d o = volume.indexToWorld.point(index);
+            const trk::Vec3d v = volume.indexToWorld.vector(direction);
+            TrkRay ray{};
+            for (int a = 0; a < 3; ++a) {
+                ray.origin[a] = static_cast<float>(o[a]);
+                ray.direction[a] = static_cast<float>(v[a]);
+            }
+            ray.tMax = rays::kInfinity;
+            PreparedRay prepared;
+            if (!volume.clip(ray, volume.field.box(), prepared.local, prepared.lengthPerVoxel)) {
+                continue;
+            }
+            uint64_t ignored = 0;
+            prepared.exactDepth =
+                static_cast<double>(volume.scale) * prepared.lengthPerVoxel *
+                volume.field.integrate(prepared.local, 0, prepared.local.tEnd, ignored, ignored);
+            if (prepared.exactDepth > 0) {
+                result.push_back(prepared);
+            }
+        }
+        return result;
+    }
+
+    trk::TrackingSettings settings(const PreparedRay& ray) const {
+        trk::TrackingSettings s;
+        s.scale = static_cast<double>(volume.scale);
+        s.lengthPerVoxel = ray.lengthPerVoxel;
+        return s;
+    }
+};
+
+/// Moments 2 to 4 of one estimate, from E[X^p] = exp(-p tau_c + integral of R ((1 - mu_r/R)^p -
+/// 1)), and its expected look-ups while tracking.
+struct Moments {
+    double transmittance = 0;
+    double variance = 0;
+    double third = 0;   ///< third cumulant
+    double fourth = 0;  ///< fourth cumulant
+    double lookups = 0;
+    double exactLength = 0;
+    double length = 0;
+};
+
+template <class Method>
+Moments momentsOf(const Scene& scene, const PreparedRay& ray) {
+    const trk::TrackingSettings settings = scene.settings(ray);
+    const LocalRay& r = ray.local;
+    const double cellsPerVoxel =
+        std::fabs(r.direction[0]) + std::fabs(r.direction[1]) + std::fabs(r.direction[2]);
+    double logMoment[5] = {0, 0, 0, 0, 0};
+    Moments m;
+    m.length = r.tEnd;
+    scene.volume.superVoxels.walk(
+        r, 0, r.tEnd, [&](const trk::SuperVoxel& v, double t0, double t1) {
+            const double control = Method::control(v);
+            const double rate = Method::bound(v);
+            const double unit = settings.lengthPerVoxel;
+            const double expected = rate * unit * (t1 - t0);
+            const auto extinction = [&](double t) {
+                return settings.scale * static_cast<double>(scene.volume.field.density(r.at(t)));
+            };
+            if (rate == 0 || expected > 2 * (1 + cellsPerVoxel * (t1 - t0))) {
+                const double depth = rate == 0
+                                         ? control * unit * (t1 - t0)
+                                         : unit * reference::integrateCells(r.origin, r.direction,
+                                                                            t0, t1, extinction);
+                for (int p = 1; p <= 4; ++p) {
+                    logMoment[p] -= p * depth;
+                }
+                if (rate > 0) {
+                    m.exactLength += t1 - t0;
+                    m.lookups += 2 * cellsPerVoxel * (t1 - t0);
+                }
+                return true;
+            }
+            m.lookups += expected;
+            for (int p = 1; p <= 4; ++p) {
+                logMoment[p] +=
+                    unit * reference::integrateCells(r.origin, r.direction, t0, t1, [&](double t) {
+                        const double w = 1 - (extinction(t) - control) / rate;
+                        return rate * (std::pow(w, p) - 1) - p * control;
+                    });
+            }
+            return true;
+        });
+    const double T = std::exp(logMoment[1]);
+    const double m2 = std::exp(logMoment[2]);
+    const double m3 = std::exp(logMoment[3]);
+    const double m4 = std::exp(logMoment[4]);
+    m.transmittance = T;
+    m.variance = std::max(m2 - T * T, 0.0);
+    m.third = m3 - 3 * T * m2 + 2 * T * T * T;
+    m.fourth = m4 - 4 * T * m3 + 6 * T * T * m2 - 3 * T * T * T * T - 3 * m.variance * m.variance;
+    return m;
+}
+
+inline Moments momentsOf(const Scene& scene, const Variant& variant, const PreparedRay& ray) {
+    return variant.residual ? momentsOf<trk::ResidualControl>(scene, ray)
+                            : momentsOf<trk::NoControl>(scene, ray);
+}
+
+/// One ray of a set, with its estimate's moments and its weight in the set's sum.
+struct TestRay {
+    PreparedRay ray;
+    Moments moments;
+    double transmittance = 1;
+    double weight = 1;
+};
+
+/// Rays whose weighted sum of errors, each the mean of `samples` estimates, is fit for a z-test:
+/// normal enough, by its exact third and fourth moments.
+struct TestSet {
+    uint64_t samples = 0;
+    std::vector<TestRay> rays;
+    double testedShare = 1;  ///< of the rays' length
+    double exactShare = 0;   ///< of the whole rays' length
+    double skewness = 0;
+    double excessKurtosis = 0;
+    double standardError = 0;
+
+    bool isNormal() const { return excessKurtosis < 0.5 && std::fabs(skewness) < 0.35; }
+
+    void add(const Scene& scene, const PreparedRay& ray, const Moments& m, double weight) {
+        // The transmittance comes from the cells, not from the moments it is compared through.
+        uint64_t ignored = 0;
+        const double depth =
+            static_cast<double>(scene.volume.scale) * ray.lengthPerVoxel *
+            scene.volume.field.integrate(ray.local, 0, ray.local.tEnd, ignored, ignored);
+        EXPECT_NEAR(m.transmittance, std::exp(-depth), 1e-6);
+        rays.push_back({ray, m, std::exp(-depth), weight});
+    }
+
+    void summarize() {
+        const auto n = static_cast<double>(samples);
+        double variance = 0;
+        double third = 0;
+        double fourth = 0;
+        for (const TestRay& r : rays) {
+            variance += r.weight * r.weight * r.moments.variance / n;
+            third += std::pow(r.weight, 3) * r.moments.third / (n * n);
+            fourth += std::pow(r.weight, 4) * r.moments.fourth / (n * n * n);
+        }
+        standardError = std::sqrt(variance);
+        skewness = third / std::pow(variance, 1.5);
+        excessKurtosis = fourth / (variance * variance);
+    }
+};
+
+/// The whole rays, each with weight 1, where that sum is normal enough. Some controls have tails
+/// that no number of samples tames on whole rays (the variance of `max` at depth 10 is beyond
+/// 1e40): there the same code, at the same scale, is tested on as much of each ray as can be, rays
+/// weighing alike.
+inline TestSet makeSet(const Scene& scene, const Variant& variant, uint64_t samples) {
+    TestSet whole;
+    whole.samples = samples;
+    double exactLength = 0;
+    double length = 0;
+    for (const PreparedRay& ray : scene.rays) {
+        const Moments m = momentsOf(scene, variant, ray);
+        exactLength += m.exactLength;
+        length += m.length;
+        whole.add(scene, ray, m, 1);
+    }
+    whole.exactShare = exactLength / length;
+    whole.summarize();
+    if (whole.isNormal()) {
+        return whole;
+    }
+    constexpr double kTail = 30;
+    TestSet cut;
+    cut.samples = samples;
+    cut.exactShare = whole.exactShare;
+    double tested = 0;
+    for (PreparedRay ray : scene.rays) {
+        for (Moments m = momentsOf(scene, variant, ray);; m = momentsOf(scene, variant, ray)) {
+            // Below, moments are the rounding error of a difference: nothing random is left.
+            if (m.variance < 1e-7 * m.transmittance * m.transmittance) {
+                break;
+            }
+            if (m.fourth < kTail * static_cast<double>(samples) * m.variance * m.variance) {
+                tested += m.length;
+                cut.add(scene, ray, m, 1 / std::sqrt(m.variance));
+                break;
+            }
+            ray.local.tEnd *= 0.8;
+        }
+    }
+    cut.testedShare = tested / length;
+    cut.summarize();
+    return cut;
+}
+
+/// z of a set: the weighted sum of (mean estimate - transmittance) in standard errors.
+/// `estimate(ray, rng)` answers one estimate.
+template <class Estimate>
+double zOf(const TestSet& set, uint64_t seed, const Estimate& estimate) {
+    double difference = 0;
+    for (size_t i = 0; i < set.rays.size(); ++i) {
+        const TestRay& r = set.rays[i];
+        double sum = 0;
+        for (uint64_t k = 0; k < set.samples; ++k) {
+            trk::Rng rng(seed, 0, i, k);
+            sum += estimate(r.ray, rng);
+        }
+        difference += r.weight * (sum / static_cast<double>(set.samples) - r.transmittance);
+    }
+    return difference / set.standardError;
+}
+
+/// Where z moves when an estimator's mean is `factor(ray)` times the transmittance.
+template <class Factor>
+double shiftOf(const TestSet& set, const Factor& factor) {
+    double difference = 0;
+    for (const TestRay& r : set.rays) {
+        difference += r.weight * r.transmittance * (factor(r.ray) - 1);
+    }
+    return difference / set.standardError;
+}
+
+}  // namespace estimates

@@ -27,9 +27,10 @@ struct LocalRay {
 
 /// Maps integer points to 32-bit entries: a dense root box over nodes of 8^3 children, as deep as
 /// the extent asks for. An entry above item level is a tile: it stands for its whole region. What
-/// an entry means beyond "empty" is its owner's; equal entries must mean equal contents. Nodes may
-/// be shared between places that look alike (large tiles have large, but very regular, surfaces).
-/// Memory goes with what is occupied; a step of the walk crosses the largest region found empty.
+/// an entry means beyond "empty" is its owner's; equal entries must mean equal contents. Nodes with
+/// equal children are one node, and one whose children are all one tile or item is that entry:
+/// large tiles have large but very regular surfaces, which thus cost next to nothing. Memory goes
+/// with what is occupied; a step of the walk crosses the largest region found empty.
 class SparseTable {
   public:
     using Entry = uint32_t;
@@ -78,9 +79,9 @@ class SparseTable {
 
     /// Fills the table top down. `uniform(origin, shift)` answers for the region of 2^shift voxels:
     /// an entry that stands for all of it, or nothing, whereupon its eight times eight times eight
-    /// parts are asked; `item(origin)` answers where items are not uniform. `key(origin, shift,
-    /// out)` may append what a region's contents follow from: regions with equal keys are built
-    /// once.
+    /// parts are asked; `item(origin)` answers where items are not uniform. `keyOf(origin, shift,
+    /// key)` may append what a region's contents follow from and answer true: regions with equal
+    /// keys are built once.
     template <class Uniform, class Item, class KeyOf>
     void fill(Uniform&& uniform, Item&& item, KeyOf&& keyOf) {
         Memo memo;

@@ -51,7 +51,10 @@ long peakOf(const std::string& vdb, const std::vector<TrkRay>& all, double& mean
     for (const float t : transmittance) {
         meanTransmittance += static_cast<double>(t) / static_cast<double>(all.size());
     }
-    return statusKilobytes("VmHWM") - before;
+    const long peak = statusKilobytes("VmHWM") - before;
+    std::printf("baked, opened and answered %zu rays in %ld kB more than before\n", all.size(),
+                peak);
+    return peak;
 }
 
 TEST(SparseVolumes, TwoPuffsFarApart) {

@@ -153,8 +153,9 @@ void zoom(Camera& camera, const track::Volume& volume, double aspect, uint32_t l
     double reach = 0;
     for (size_t i = 0; i < depth.size(); ++i) {
         if (depth[i] > 0) {
-            const auto column = static_cast<double>(i % static_cast<size_t>(width));
-            const auto row = static_cast<double>(i / static_cast<size_t>(width));
+            const size_t whole = i / static_cast<size_t>(width);
+            const auto row = static_cast<double>(whole);
+            const auto column = static_cast<double>(i - whole * static_cast<size_t>(width));
             reach = std::max({reach, std::fabs(2 * (column + 0.5) / width - 1) + 1.0 / width,
                               std::fabs(2 * (row + 0.5) / kHeight - 1) + 1.0 / kHeight});
         }
@@ -193,8 +194,8 @@ Image compose(const std::vector<double>& depth, double scale, int width, int hei
     for (size_t c = 0; c < 3; ++c) {
         std::vector<float>& channel = image.add(names[c]);
         for (size_t i = 0; i < depth.size(); ++i) {
-            const auto row = static_cast<float>(i / static_cast<size_t>(width));
-            const float down = (row + 0.5f) / static_cast<float>(height);
+            const size_t row = i / static_cast<size_t>(width);
+            const float down = (static_cast<float>(row) + 0.5f) / static_cast<float>(height);
             channel[i] = (zenith[c] + (horizon[c] - zenith[c]) * down * down) *
                          image.channels["transmittance"][i];
         }

@@ -338,7 +338,13 @@ AffineMap affineMap(const openvdb::math::Transform& transform, const std::string
             TRK_ERROR_UNSUPPORTED_GRID,
             where + ": has a frustum transform; expected an affine one (resample it first)");
     }
-    const openvdb::Mat4d matrix = transform.baseMap()->getAffineMap()->getMat4();
+    openvdb::Mat4d matrix;
+    try {
+        matrix = transform.baseMap()->getAffineMap()->getMat4();
+    } catch (const openvdb::Exception& e) {  // OpenVDB's own limit: a determinant below 3e-15
+        throw Error(TRK_ERROR_UNSUPPORTED_GRID,
+                    where + ": has a transform that OpenVDB refuses: " + firstLine(e));
+    }
     AffineMap map;  // OpenVDB multiplies row vectors from the left
     for (int row = 0; row < 3; ++row) {
         for (int column = 0; column < 3; ++column) {

@@ -108,6 +108,23 @@ uint32_t repairBits(const Arguments& arguments) {
     return bits;
 }
 
+void addColorOption(po::options_description& options) {
+    options.add_options()("color", po::value<std::string>()->default_value("1,1,1"),
+                          "r,g,b: extinction of channel k = scale x color_k x density; three that "
+                          "differ tint a density of one channel");
+}
+
+void applyColor(const Arguments& arguments, TrkVolumeOptions& options) {
+    const std::string text = arguments.text("color");
+    const std::vector<double> color = numberList("color", text, 3);
+    for (size_t c = 0; c < 3; ++c) {
+        options.color[c] = static_cast<float>(color[c]);
+        if (!(color[c] >= 0) || !std::isfinite(options.color[c])) {
+            throw UsageError("--color " + text + ": expected three finite numbers >= 0");
+        }
+    }
+}
+
 float nonNegative(const Arguments& arguments, const std::string& option) {
     const float value = arguments.get<float>(option);
     if (!(value >= 0) || !std::isfinite(value)) {

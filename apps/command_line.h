@@ -72,6 +72,11 @@ void refuseInput(const std::string& output, const std::vector<std::string>& inpu
 void addGridOptions(boost::program_options::options_description& options);
 uint32_t repairBits(const Arguments& arguments);
 
+/// --color r,g,b: what each channel's extinction is multiplied by.
+void addColorOption(boost::program_options::options_description& options);
+/// Its value, written to the options of a volume.
+void applyColor(const Arguments& arguments, TrkVolumeOptions& options);
+
 /// A finite number >= 0, or a UsageError that names the option.
 float nonNegative(const Arguments& arguments, const std::string& option);
 

@@ -2,6 +2,7 @@
 // vdbtrack info: what a .vdb file or a sidecar holds.
 #include "command_line.h"
 
+#include "bake.h"
 #include "error.h"
 #include "io/density.h"
 #include "io/sidecar.h"
@@ -79,7 +80,13 @@ Json describeSidecar(const std::string& path) {
     json["source_grid"] = header.source.name;
     json["source_index"] = header.source.index;
     json["tool_version"] = header.toolVersion;
-    json["control"] = header.controlKind;
+    json["channels"] = sidecar.baked.channels;
+    json["control"] = trk::controlName(header.controlKind);
+    const vdbtools::ControlFit fit = vdbtools::measureFit(sidecar.baked);
+    json["residual_rms"] = fit.residualRms;
+    json["constant_residual_rms"] = fit.constantRms;
+    json["field_rms"] = fit.fieldRms;
+    json["control_mass_ratio"] = fit.massRatio;
     json["super_voxel_size"] = header.superVoxelSize;
     json["super_voxels"] = sidecar.baked.table.occupiedItems();
     json["levels"] = header.levels;
@@ -118,6 +125,26 @@ std::string formatRepairs(const Json& json) {
             std::to_string(json["clamped_negative"].get<uint64_t>()) + " negative values read as 0";
     }
     return text.empty() ? "nothing" : text;
+}
+
+/// What the control leaves of the density, in numbers.
+std::string formatFit(const Json& json) {
+    const double residual = json["residual_rms"];
+    const double field = json["field_rms"];
+    const double constant = json["constant_residual_rms"];
+    if (field == 0) {
+        return "nothing to fit";
+    }
+    char text[160];
+    std::snprintf(text, sizeof(text), "residual RMS %.4g, %.3g %% of the density's %.4g", residual,
+                  100 * residual / field, field);
+    std::string line = text;
+    if (json["control"] != "constant" && constant > 0) {
+        std::snprintf(text, sizeof(text), "; a constant control leaves %.3g %%; mass kept %.4g %%",
+                      100 * constant / field, 100 * json["control_mass_ratio"].get<double>());
+        line += text;
+    }
+    return line;
 }
 
 /// 3 numbers as "a x b x c", or once where they agree.
@@ -169,7 +196,9 @@ void run(const Command& command, const std::vector<std::string>& given) {
                   << "\" of " << json["source_file"].get<std::string>() << "\n"
                   << "  super-voxels  " << json["super_voxels"] << " of "
                   << json["super_voxel_size"] << "^3 voxels\n"
+                  << "  channels      " << json["channels"] << "\n"
                   << "  control       " << json["control"].get<std::string>() << "\n"
+                  << "  fit           " << formatFit(json) << "\n"
                   << "  levels        " << json["levels"] << "\n"
                   << "  voxel size    " << formatSize(json["voxel_size"]) << "\n"
                   << "  bounds        " << formatBounds(json) << "\n"

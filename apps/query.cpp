@@ -126,6 +126,19 @@ std::string number(double value) {
     return text;
 }
 
+std::string header(size_t channels) {
+    std::string text = "ray";
+    for (const char* name : {"transmittance", "stderr", "optical_depth"}) {
+        for (size_t c = 0; c < channels; ++c) {
+            text += std::string(",") + name;
+            if (channels > 1) {
+                text += std::string("_") + "rgb"[c];
+            }
+        }
+    }
+    return text + ",lookups\n";
+}
+
 void run(const Command& command, const std::vector<std::string>& given) {
     po::options_description options("Options");
     options.add_options()("rays", po::value<std::string>(),
@@ -137,13 +150,15 @@ void run(const Command& command, const std::vector<std::string>& given) {
         "rate", po::value<float>()->default_value(1.0f, "1"),
         "multiplies the sampling rate of residual and ratio")(
         "choice", po::value<std::string>()->default_value("robust"),
-        "control of the residual method: robust, mean, min or max")(
+        "control of the residual method: robust, mean, min or max (the last two only where it was "
+        "baked constant)")(
         "level", po::value<int>()->default_value(0), "preview level of the control method")(
         "seed", po::value<uint64_t>()->default_value(0), "of the random numbers")(
         "stream", po::value<uint64_t>()->default_value(0), "independent random numbers")(
         "scale", po::value<float>()->default_value(1.0f, "1"), "extinction = scale x density")(
         "output,o", po::value<std::string>(), "CSV file to write; default: stdout")(
         "force", po::bool_switch(), "replace an existing file");
+    addColorOption(options);
     addGridOptions(options);
     const Arguments arguments(command, given, options, {"IN.vdb"}, 1);
     if (!arguments.has("rays")) {
@@ -162,6 +177,7 @@ void run(const Command& command, const std::vector<std::string>& given) {
     query.stream = arguments.get<uint64_t>("stream");
     TrkVolumeOptions volumeOptions = trkDefaultVolumeOptions();
     volumeOptions.scale = nonNegative(arguments, "scale");
+    applyColor(arguments, volumeOptions);
     volumeOptions.choice = choiceIndex("choice", arguments.text("choice"), kChoices);
     volumeOptions.repair = repairBits(arguments);
     const std::string grid = arguments.text("grid");
@@ -186,13 +202,14 @@ void run(const Command& command, const std::vector<std::string>& given) {
                                                      volumeOptions);
 
     std::ostringstream out;
-    out << "ray,transmittance,stderr,optical_depth,lookups\n";
+    const size_t channels = volume.info().channels;
+    out << header(channels);
     constexpr size_t kChunk = 1 << 14;
     const bool deterministic =
         query.method == TRK_METHOD_EXACT || query.method == TRK_METHOD_CONTROL;
-    std::vector<float> transmittance(kChunk);
+    std::vector<float> transmittance(kChunk * channels);
     std::vector<TrkStatistics> statistics(kChunk);
-    std::vector<double> depth(kChunk, std::numeric_limits<double>::quiet_NaN());
+    std::vector<double> depth(kChunk * channels, std::numeric_limits<double>::quiet_NaN());
     {
         Progress progress(arguments, "tracing " + std::to_string(rays.size()) + " rays");
         for (size_t begin = 0; begin < rays.size() || begin == 0; begin += kChunk) {
@@ -204,9 +221,16 @@ void run(const Command& command, const std::vector<std::string>& given) {
                 volume.integrateOpticalDepth(query, rays.data() + begin, count, depth.data());
             }
             for (size_t i = 0; i < count; ++i) {
-                out << begin + i << ',' << number(static_cast<double>(transmittance[i])) << ','
-                    << number(static_cast<double>(statistics[i].standardError[0])) << ','
-                    << number(depth[i]) << ',' << statistics[i].lookups << '\n';
+                out << begin + i;
+                const auto addChannels = [&](const auto* values) {
+                    for (size_t c = 0; c < channels; ++c) {
+                        out << ',' << number(static_cast<double>(values[c]));
+                    }
+                };
+                addChannels(&transmittance[i * channels]);
+                addChannels(statistics[i].standardError);
+                addChannels(&depth[i * channels]);
+                out << ',' << statistics[i].lookups << '\n';
             }
             progress.update(static_cast<double>(begin + count) /
                             static_cast<double>(std::max<size_t>(rays.size(), 1)));
@@ -232,7 +256,8 @@ const Command kQueryCommand{
     "query",
     "vdbtrack query IN.vdb --rays RAYS.csv [--sidecar S] [--grid NAME] [--method residual] "
     "[--samples 16] [--rate 1] [--choice robust] [--level 0] [--seed 0] [--stream 0] [--scale 1] "
-    "[-o OUT.csv] [--force]",
-    "Prints the transmittance of rays: ray,transmittance,stderr,optical_depth,lookups.", run};
+    "[--color 1,1,1] [-o OUT.csv] [--force]",
+    "Prints the transmittance of rays: ray,transmittance,stderr,optical_depth,lookups; in colour "
+    "with _r, _g, _b.", run};
 
 }  // namespace apps

@@ -1,12 +1,16 @@
 // SPDX-License-Identifier: Apache-2.0
 #include "bake.h"
 
+#include "control_fit.h"
+#include "hash.h"
+
 #include <tbb/blocked_range.h>
 #include <tbb/parallel_for.h>
 
 #include <algorithm>
 #include <cmath>
 #include <limits>
+#include <map>
 #include <optional>
 #include <unordered_map>
 #include <vector>
@@ -19,8 +23,11 @@ using trk::BakedVolume;
 using trk::ExtinctionField;
 using trk::Int3;
 using trk::roundUp;
-using trk::ScalarTable;
+using trk::ControlKind;
+using trk::ControlPolynomial;
 using trk::SparseTable;
+using trk::ValueTable;
+using trk::Vec3d;
 
 constexpr float kInfinity = std::numeric_limits<float>::infinity();
 
@@ -32,76 +39,193 @@ struct Moments {
     float max = 0;
     double mean = 0;
     double squares = 0;
+    CornerMoments corners{};  ///< where a fit asks for them
 };
 
 Moments constantMoments(float value) {
-    return {value, value, static_cast<double>(value), 0};
+    const auto v = static_cast<double>(value);
+    Moments m{value, value, v, 0, {}};
+    m.corners.fill(0.125 * v);
+    return m;
+}
+
+double trapezoid(size_t i, size_t last) {
+    return i == 0 || i == last ? 0.5 : 1.0;
+}
+
+/// One channel of a brick of the field, or of a part of one.
+struct BrickChannel {
+    const float* first;  ///< vertex at the cube's origin
+
+    const float* row(size_t x, size_t y) const {
+        return first + (x * ExtinctionField::kBrickEdge + y) * ExtinctionField::kBrickEdge;
+    }
+};
+
+CornerMoments cornerMoments(const BrickChannel& brick, size_t size) {
+    CornerMoments corners{};
+    const auto n = static_cast<double>(size);
+    for (size_t x = 0; x <= size; ++x) {
+        double plane[4] = {0, 0, 0, 0};  // by corner in y and z
+        for (size_t y = 0; y <= size; ++y) {
+            const float* row = brick.row(x, y);
+            double sum = 0.5 * (static_cast<double>(row[0]) + static_cast<double>(row[size]));
+            double upper = 0.5 * static_cast<double>(row[size]);
+            for (size_t z = 1; z < size; ++z) {
+                sum += static_cast<double>(row[z]);
+                upper += static_cast<double>(row[z]) * (static_cast<double>(z) / n);
+            }
+            const double weight = trapezoid(y, size);
+            const double up = static_cast<double>(y) / n;
+            plane[0] += weight * (1 - up) * (sum - upper);
+            plane[1] += weight * (1 - up) * upper;
+            plane[2] += weight * up * (sum - upper);
+            plane[3] += weight * up * upper;
+        }
+        const double weight = trapezoid(x, size) / (n * n * n);
+        const double up = static_cast<double>(x) / n;
+        for (size_t k = 0; k < 4; ++k) {
+            corners[k] += weight * (1 - up) * plane[k];
+            corners[4 + k] += weight * up * plane[k];
+        }
+    }
+    return corners;
 }
 
 /// Moments of one cube of `size`^3 cells of a brick. Two passes over values that are in L1:
 /// deviations from the mean do not cancel, and a cube of equal values has a mean of that very
 /// value.
-Moments cubeMoments(const float* first, size_t size) {
-    constexpr size_t kEdge = ExtinctionField::kBrickEdge;
-    const auto weight = [size](size_t i) { return i == 0 || i == size ? 0.5 : 1.0; };
+Moments cubeMoments(const BrickChannel& brick, size_t size, bool withCorners) {
     const auto weighted = [&](const auto& term) {
         double sum = 0;
         for (size_t x = 0; x <= size; ++x) {
             double plane = 0;
             for (size_t y = 0; y <= size; ++y) {
-                const float* row = first + (x * kEdge + y) * kEdge;
+                const float* row = brick.row(x, y);
                 double line = 0.5 * (term(row[0]) + term(row[size]));
                 for (size_t z = 1; z < size; ++z) {
                     line += term(row[z]);
                 }
-                plane += weight(y) * line;
+                plane += trapezoid(y, size) * line;
             }
-            sum += weight(x) * plane;
+            sum += trapezoid(x, size) * plane;
         }
         return sum;
     };
     Moments m;
-    m.min = m.max = first[0];
+    m.min = m.max = *brick.first;
     for (size_t x = 0; x <= size; ++x) {
         for (size_t y = 0; y <= size; ++y) {
-            const float* row = first + (x * kEdge + y) * kEdge;
+            const float* row = brick.row(x, y);
             for (size_t z = 0; z <= size; ++z) {
                 m.min = std::min(m.min, row[z]);
                 m.max = std::max(m.max, row[z]);
             }
         }
     }
+    if (m.min == m.max) {
+        return constantMoments(m.min);
+    }
     m.mean = weighted([](float v) { return static_cast<double>(v); }) /
              static_cast<double>(size * size * size);
-    m.squares = m.min == m.max ? 0 : weighted([&](float v) {
+    m.squares = weighted([&](float v) {
         const double d = static_cast<double>(v) - m.mean;
         return d * d;
     });
+    if (withCorners) {
+        m.corners = cornerMoments(brick, size);
+    }
     return m;
 }
 
 class Baker {
   public:
-    Baker(const ExtinctionField& field, int superVoxelSize)
-        : field_(field), size_(superVoxelSize), cube_(std::min(superVoxelSize, 8)) {
-        while (1 << shift_ < superVoxelSize) {
+    Baker(const ExtinctionField& field, const BakeOptions& options)
+        : field_(field),
+          kind_(options.kind),
+          channels_(field.channels()),
+          size_(options.superVoxelSize),
+          cube_(std::min(options.superVoxelSize, 8)) {
+        while (1 << shift_ < size_) {
             ++shift_;
         }
         computeCubes();
     }
 
     BakedVolume bake() {
-        BakedVolume baked;
-        baked.superVoxelShift = shift_;
-        SparseTable plan(shift_, field_.box());
-        std::vector<Int3> jobs;
+        planSuperVoxels();
+        moments_.resize(jobs_.size() * channels_);
+        forEach(jobs_.size(), [&](size_t i) {
+            for (size_t c = 0; c < channels_; ++c) {
+                moments_[i * channels_ + c] = momentsOf(jobs_[i], c);
+            }
+        });
+        baked_.superVoxelShift = shift_;
+        baked_.channels = channels_;
+        baked_.kind = kind_;
+        if (kind_ == ControlKind::kTrilinear) {
+            fitCorners();
+        } else {
+            makeItems();
+        }
+        baked_.items.resize(itemJobs_.size() * channels_);
+        forEach(itemJobs_.size(), [&](size_t i) {
+            for (size_t c = 0; c < channels_; ++c) {
+                finish(i, c);
+            }
+        });
+        return std::move(baked_);
+    }
+
+  private:
+    using Entry = SparseTable::Entry;
+
+    template <class Body>
+    static void forEach(size_t count, const Body& body) {
+        tbb::parallel_for(tbb::blocked_range<size_t>(0, count, 32),
+                          [&](const tbb::blocked_range<size_t>& range) {
+                              for (size_t i = range.begin(); i != range.end(); ++i) {
+                                  body(i);
+                              }
+                          });
+    }
+
+    /// Moments of every cube of every brick: each vertex is read once, whatever shares its brick.
+    void computeCubes() {
+        const auto edge = static_cast<size_t>(cube_);
+        const size_t perAxis = 8 / edge;
+        const size_t cubesPerBrick = perAxis * perAxis * perAxis;
+        cubes_.resize(field_.brickCount() * cubesPerBrick * channels_);
+        forEach(field_.brickCount(), [&](size_t b) {
+            float vertices[ExtinctionField::kBrickVertices];
+            for (size_t c = 0; c < channels_; ++c) {
+                for (size_t i = 0; i < ExtinctionField::kBrickVertices; ++i) {
+                    vertices[i] = field_.vertex(static_cast<Entry>(b + 1), i, c);
+                }
+                for (size_t k = 0; k < cubesPerBrick; ++k) {
+                    const size_t x = k / (perAxis * perAxis) * edge;
+                    const size_t y = k / perAxis % perAxis * edge;
+                    const size_t z = k % perAxis * edge;
+                    const BrickChannel brick{BrickChannel{vertices}.row(x, y) + z};
+                    cubes_[(b * cubesPerBrick + k) * channels_ + c] =
+                        cubeMoments(brick, edge, kind_ != ControlKind::kConstant);
+                }
+            }
+        });
+    }
+
+    /// Which super-voxels there are, equal ones once: their places in `jobs_`, in `plan_` the index
+    /// of each, plus one.
+    void planSuperVoxels() {
+        plan_ = SparseTable(shift_, field_.box());
+        const Entry single = kind_ == ControlKind::kConstant ? 0 : SparseTable::kSingleFlag;
         const auto addJob = [&](const Int3& origin) {
-            jobs.push_back(origin);
-            return static_cast<SparseTable::Entry>(jobs.size());
+            jobs_.push_back(origin);
+            return static_cast<Entry>(jobs_.size());
         };
-        std::unordered_map<SparseTable::Entry, SparseTable::Entry> constants;
-        plan.fill(
-            [&](const Int3& origin, int shift) -> std::optional<SparseTable::Entry> {
+        std::unordered_map<Entry, Entry> constants;
+        plan_.fill(
+            [&](const Int3& origin, int shift) -> std::optional<Entry> {
                 const auto entry = field_.table().uniformEntry(origin, shift);
                 if (!entry || !ExtinctionField::isConstant(*entry)) {
                     return std::nullopt;
@@ -109,143 +233,347 @@ class Baker {
                 if (*entry == SparseTable::kEmpty) {
                     return SparseTable::kEmpty;
                 }
-                SparseTable::Entry& known = constants[*entry];
+                Entry& known = constants[*entry];
                 known = known == SparseTable::kEmpty ? addJob(origin) : known;
                 return known;
             },
-            addJob,
+            [&](const Int3& origin) { return addJob(origin) | single; },
             // The surface of a large tile repeats a handful of patterns of bricks.
             [&](const Int3& origin, int shift, SparseTable::Key& key) {
                 return field_.table().appendKey(origin, shift, key);
             });
-        std::vector<BakedSuperVoxel> results(jobs.size());
-        tbb::parallel_for(tbb::blocked_range<size_t>(0, jobs.size(), 32),
-                          [&](const tbb::blocked_range<size_t>& range) {
-                              for (size_t i = range.begin(); i != range.end(); ++i) {
-                                  results[i] = superVoxel(jobs[i]);
-                              }
-                          });
-        std::vector<SparseTable::Entry> itemOf(jobs.size(), SparseTable::kEmpty);
-        for (size_t i = 0; i < jobs.size(); ++i) {
-            if (results[i].max > 0) {
-                baked.items.push_back(results[i]);
-                itemOf[i] = static_cast<SparseTable::Entry>(baked.items.size());
+    }
+
+    /// Calls body(cube's origin in the super-voxel, brick entry, cube's origin in the brick) for
+    /// every cube of a super-voxel.
+    template <class Body>
+    void forEachCube(const Int3& origin, const Body& body) const {
+        for (int64_t x = 0; x < size_; x += cube_) {
+            for (int64_t y = 0; y < size_; y += cube_) {
+                for (int64_t z = 0; z < size_; z += cube_) {
+                    const Int3 at{{origin[0] + x, origin[1] + y, origin[2] + z}};
+                    const Entry entry = field_.table().find(at[0], at[1], at[2]).entry;
+                    body(Int3{{x, y, z}}, entry, Int3{{at[0] & 7, at[1] & 7, at[2] & 7}});
+                }
             }
         }
-        baked.table = plan.mapped([&](SparseTable::Entry entry) { return itemOf[entry - 1]; });
-        return baked;
     }
 
-  private:
-    /// Moments of every cube of every brick: each vertex is read once, whatever shares its brick.
-    void computeCubes() {
-        const size_t perAxis = static_cast<size_t>(8 / cube_);
-        const size_t cubesPerBrick = perAxis * perAxis * perAxis;
-        cubes_.resize(field_.brickCount() * cubesPerBrick);
-        tbb::parallel_for(tbb::blocked_range<size_t>(0, field_.brickCount(), 64),
-                          [&](const tbb::blocked_range<size_t>& range) {
-                              float vertices[ExtinctionField::kBrickVertices];
-                              for (size_t b = range.begin(); b != range.end(); ++b) {
-                                  field_.copyBrick(static_cast<SparseTable::Entry>(b + 1),
-                                                   vertices);
-                                  for (size_t c = 0; c < cubesPerBrick; ++c) {
-                                      const auto edge = static_cast<size_t>(cube_);
-                                      const size_t x = c / (perAxis * perAxis) * edge;
-                                      const size_t y = c / perAxis % perAxis * edge;
-                                      const size_t z = c % perAxis * edge;
-                                      cubes_[b * cubesPerBrick + c] =
-                                          cubeMoments(vertices +
-                                                          (x * ExtinctionField::kBrickEdge + y) *
-                                                              ExtinctionField::kBrickEdge +
-                                                          z,
-                                                      edge);
-                                  }
-                              }
-                          });
-    }
-
-    Moments cubeAt(int64_t x, int64_t y, int64_t z) const {
-        const SparseTable::Entry entry = field_.table().find(x, y, z).entry;
+    Moments cubeAt(Entry entry, const Int3& inBrick, size_t channel) const {
         if (ExtinctionField::isConstant(entry)) {
-            return constantMoments(field_.constant(entry));
+            return constantMoments(field_.constant(entry)[channel]);
         }
         const int64_t perAxis = 8 / cube_;
         const int64_t within =
-            ((x & 7) / cube_ * perAxis + (y & 7) / cube_) * perAxis + (z & 7) / cube_;
-        return cubes_[(entry - 1) * static_cast<size_t>(perAxis * perAxis * perAxis) +
-                      static_cast<size_t>(within)];
+            (inBrick[0] / cube_ * perAxis + inBrick[1] / cube_) * perAxis + inBrick[2] / cube_;
+        const size_t cube = (entry - 1) * static_cast<size_t>(perAxis * perAxis * perAxis) +
+                            static_cast<size_t>(within);
+        return cubes_[cube * channels_ + channel];
     }
 
-    BakedSuperVoxel superVoxel(const Int3& origin) const {
-        const int64_t count = size_ / cube_;
-        const auto n = static_cast<double>(count * count * count);
-        const auto forEachCube = [&](const auto& body) {
-            for (int64_t x = 0; x < count; ++x) {
-                for (int64_t y = 0; y < count; ++y) {
-                    for (int64_t z = 0; z < count; ++z) {
-                        body(cubeAt(origin[0] + x * cube_, origin[1] + y * cube_,
-                                    origin[2] + z * cube_));
-                    }
-                }
-            }
-        };
+    Moments momentsOf(const Int3& origin, size_t channel) const {
+        const double count = std::pow(size_ / cube_, 3);
         Moments all;
         all.min = kInfinity;
-        forEachCube([&](const Moments& m) {
+        forEachCube(origin, [&](const Int3& offset, Entry entry, const Int3& inBrick) {
+            const Moments m = cubeAt(entry, inBrick, channel);
             all.min = std::min(all.min, m.min);
             all.max = std::max(all.max, m.max);
             all.mean += m.mean;
-        });
-        all.mean /= n;
-        const auto cells = static_cast<double>(cube_ * cube_ * cube_);
-        forEachCube([&](const Moments& m) {  // [Chan, Golub, LeVeque 1979]
-            all.squares += m.squares + cells * (m.mean - all.mean) * (m.mean - all.mean);
+            if (kind_ != ControlKind::kConstant) {
+                addCorners(m.corners, offset, 1 / count, all.corners);
+            }
         });
         if (all.min == all.max) {
-            all = constantMoments(all.min);
+            return constantMoments(all.min);
         }
-        return finish(all);
+        all.mean /= count;
+        const auto cells = static_cast<double>(cube_ * cube_ * cube_);
+        forEachCube(origin, [&](const Int3&, Entry entry, const Int3& inBrick) {
+            const Moments m = cubeAt(entry, inBrick, channel);  // [Chan, Golub, LeVeque 1979]
+            all.squares += m.squares + cells * (m.mean - all.mean) * (m.mean - all.mean);
+        });
+        return all;
     }
 
-    BakedSuperVoxel finish(const Moments& m) const {
-        BakedSuperVoxel v;
+    /// The super-voxel's hat functions are multilinear in each of its cubes too.
+    void addCorners(const CornerMoments& cube, const Int3& offset, double scale,
+                    CornerMoments& sum) const {
+        double hat[3][2][2];  // axis, corner of the super-voxel, corner of the cube
+        for (size_t a = 0; a < 3; ++a) {
+            for (size_t k = 0; k < 2; ++k) {
+                const auto at = static_cast<double>(offset[a] + static_cast<int64_t>(k) * cube_);
+                hat[a][1][k] = at / size_;
+                hat[a][0][k] = 1 - hat[a][1][k];
+            }
+        }
+        for (size_t i = 0; i < 8; ++i) {
+            for (size_t k = 0; k < 8; ++k) {
+                sum[i] += scale * cube[k] * hat[0][i >> 2][k >> 2] *
+                          hat[1][i >> 1 & 1][k >> 1 & 1] * hat[2][i & 1][k & 1];
+            }
+        }
+    }
+
+    const Moments& moments(size_t job, size_t channel) const {
+        return moments_[job * channels_ + channel];
+    }
+    bool isEmpty(size_t job) const {
+        bool empty = true;
+        for (size_t c = 0; c < channels_; ++c) {
+            empty = empty && !(moments(job, c).max > 0);
+        }
+        return empty;
+    }
+    bool isHomogeneous(size_t job) const {
+        bool homogeneous = true;
+        for (size_t c = 0; c < channels_; ++c) {
+            homogeneous = homogeneous && moments(job, c).min == moments(job, c).max;
+        }
+        return homogeneous;
+    }
+
+    /// One item a job, with the job's own gradients where the control is affine.
+    void makeItems() {
+        std::vector<Entry> itemOf(jobs_.size(), SparseTable::kEmpty);
+        for (size_t i = 0; i < jobs_.size(); ++i) {
+            if (isEmpty(i)) {
+                continue;
+            }
+            itemJobs_.push_back(i);
+            itemOf[i] = static_cast<Entry>(itemJobs_.size());
+            if (kind_ == ControlKind::kAffine) {
+                for (size_t c = 0; c < channels_; ++c) {
+                    const auto mean = static_cast<double>(meanOf(moments(i, c)));
+                    const auto gradient = fitGradient(moments(i, c).corners, mean, size_);
+                    baked_.shapes.insert(baked_.shapes.end(), gradient.begin(), gradient.end());
+                }
+                itemOf[i] |= isHomogeneous(i) ? 0 : SparseTable::kSingleFlag;
+            }
+        }
+        baked_.table = plan_.mapped([&](Entry entry) { return itemOf[SparseTable::index(entry)]; });
+    }
+
+    Int3 cellOf(const Int3& local) const {
+        return {{local[0] >> shift_, local[1] >> shift_, local[2] >> shift_}};
+    }
+    /// The job of the super-voxel at a place, or nothing where it is empty.
+    std::optional<size_t> jobAt(const Int3& cell) const {
+        const Entry entry =
+            plan_.find(cell[0] << shift_, cell[1] << shift_, cell[2] << shift_).entry;
+        return entry == SparseTable::kEmpty ? std::nullopt
+                                            : std::optional<size_t>(SparseTable::index(entry));
+    }
+
+    /// Corner values over all super-voxels together. A homogeneous super-voxel, empty ones
+    /// included, keeps its value at its corners: it is never given a residual.
+    void fitCorners() {
+        std::vector<Int3> cells;  // those that are not homogeneous, by their place
+        std::vector<size_t> jobOf;
+        plan_.forEach([&](const Int3& lo, int shift, Entry entry) {
+            const size_t job = SparseTable::index(entry);
+            if (shift == shift_ && !isHomogeneous(job)) {
+                cells.push_back(cellOf(lo));
+                jobOf.push_back(job);
+            }
+        });
+        std::vector<std::vector<std::array<float, 8>>> corners(channels_);
+        for (size_t c = 0; c < channels_; ++c) {
+            corners[c] = fitChannel(cells, jobOf, c);
+        }
+        std::unordered_map<Int3, size_t, PlaceHash> cellAt;
+        for (size_t i = 0; i < cells.size(); ++i) {
+            cellAt.emplace(cells[i], i);
+        }
+        std::map<std::vector<float>, Entry> known;  // job and corners, as floats hold them
+        const auto itemFor = [&](size_t job, const std::vector<float>& shape) {
+            std::vector<float> key = shape;
+            key.push_back(static_cast<float>(job >> 16));
+            key.push_back(static_cast<float>(job & 0xffff));
+            const auto [it, isNew] =
+                known.try_emplace(std::move(key), static_cast<Entry>(itemJobs_.size() + 1));
+            if (isNew) {
+                itemJobs_.push_back(job);
+                baked_.shapes.insert(baked_.shapes.end(), shape.begin(), shape.end());
+            }
+            return it->second;
+        };
+        std::vector<float> shape(8 * channels_);
+        baked_.table = SparseTable(shift_, field_.box());
+        baked_.table.fill(
+            [&](const Int3& origin, int shift) -> std::optional<Entry> {
+                const auto entry = plan_.uniformEntry(origin, shift);
+                if (!entry) {
+                    return std::nullopt;
+                }
+                if (*entry == SparseTable::kEmpty) {
+                    return SparseTable::kEmpty;
+                }
+                const size_t job = SparseTable::index(*entry);
+                if (isEmpty(job)) {
+                    return SparseTable::kEmpty;
+                }
+                if (isHomogeneous(job)) {
+                    for (size_t i = 0; i < shape.size(); ++i) {
+                        shape[i] = moments(job, i / 8).min;
+                    }
+                    return itemFor(job, shape);
+                }
+                if (shift > shift_) {
+                    return std::nullopt;
+                }
+                const size_t cell = cellAt.at(cellOf(origin));
+                for (size_t i = 0; i < shape.size(); ++i) {
+                    shape[i] = corners[i / 8][cell][i % 8];
+                }
+                return itemFor(job, shape) | SparseTable::kSingleFlag;
+            },
+            [](const Int3&) { return SparseTable::kEmpty; });  // an item is always uniform
+    }
+
+    struct PlaceHash {
+        size_t operator()(const Int3& p) const { return trk::hashWords(p.data(), p.size(), 0); }
+    };
+
+    std::vector<std::array<float, 8>> fitChannel(const std::vector<Int3>& cells,
+                                                 const std::vector<size_t>& jobOf,
+                                                 size_t channel) const {
+        std::vector<CornerFit::Cell> fitted;
+        std::vector<CornerFit::Fixed> fixed;
+        for (size_t i = 0; i < cells.size(); ++i) {
+            fitted.push_back({cells[i], &moments(jobOf[i], channel).corners});
+            for (int64_t n = 0; n < 27; ++n) {
+                const Int3 step{{n / 9 - 1, n / 3 % 3 - 1, n % 3 - 1}};
+                const auto job = jobAt(
+                    {{cells[i][0] + step[0], cells[i][1] + step[1], cells[i][2] + step[2]}});
+                if (!job || moments(*job, channel).min == moments(*job, channel).max) {
+                    addShared(cells[i], step, job ? moments(*job, channel).min : 0, fixed);
+                }
+            }
+        }
+        const CornerFit fit(fitted, fixed, size_);
+        std::vector<std::array<float, 8>> result;
+        for (size_t i = 0; i < cells.size(); ++i) {
+            result.push_back(fit.corners(i));
+        }
+        return result;
+    }
+
+    /// The corners that a cell has in common with its neighbour one step away.
+    static void addShared(const Int3& cell, const Int3& step, float value,
+                          std::vector<CornerFit::Fixed>& fixed) {
+        for (int64_t corner = 0; corner < 8; ++corner) {
+            const Int3 bits{{corner >> 2, corner >> 1 & 1, corner & 1}};
+            bool shared = true;
+            for (size_t a = 0; a < 3; ++a) {
+                shared = shared && (step[a] == 0 || (step[a] > 0) == (bits[a] > 0));
+            }
+            if (shared) {
+                fixed.push_back(
+                    {{{cell[0] + bits[0], cell[1] + bits[1], cell[2] + bits[2]}}, value});
+            }
+        }
+    }
+
+    static float meanOf(const Moments& m) {
+        return std::min(std::max(static_cast<float>(m.mean), m.min), m.max);
+    }
+
+    void finish(size_t item, size_t channel) {
+        const size_t job = itemJobs_[item];
+        const Moments& m = moments(job, channel);
+        BakedSuperVoxel& v = baked_.items[item * channels_ + channel];
         v.min = m.min;
         v.max = m.max;
-        v.control = std::min(std::max(static_cast<float>(m.mean), m.min), m.max);
-        const auto control = static_cast<double>(v.control);
-        v.majorant = roundUp(
-            std::max(control - static_cast<double>(m.min), static_cast<double>(m.max) - control));
-        const double cells = static_cast<double>(size_) * size_ * size_;
-        const double offset = control - m.mean;  // the control is the mean rounded to float
-        v.rms = m.min == m.max
-                    ? 0.0f
-                    : std::min(roundUp(std::sqrt(m.squares / cells + offset * offset)), v.majorant);
-        return v;
+        v.mean = meanOf(m);
+        if (m.min == m.max) {
+            return;
+        }
+        const auto mean = static_cast<double>(v.mean);
+        const float reach = roundUp(
+            std::max(mean - static_cast<double>(m.min), static_cast<double>(m.max) - mean));
+        const double cells = std::pow(size_, 3);
+        const double offset = mean - m.mean;  // the mean was rounded to float
+        v.deviation = std::min(roundUp(std::sqrt(m.squares / cells + offset * offset)), reach);
+        v.majorant = reach;
+        v.rms = v.deviation;
+        if (kind_ != ControlKind::kConstant) {
+            compareWithControl(jobs_[job], channel,
+                               baked_.control(item * channels_ + channel), v);
+        }
+    }
+
+    /// Bound and RMS of what a control that is not constant leaves, vertex by vertex.
+    void compareWithControl(const Int3& origin, size_t channel,
+                            const ControlPolynomial<double>& control, BakedSuperVoxel& v) const {
+        double majorant = 0;
+        double squares = 0;
+        const auto edge = static_cast<size_t>(cube_);
+        forEachCube(origin, [&](const Int3& offset, Entry entry, const Int3& inBrick) {
+            const bool constant = ExtinctionField::isConstant(entry);
+            const auto unit = [&](size_t axis, size_t i) {
+                return (static_cast<double>(offset[axis]) + static_cast<double>(i)) / size_ - 0.5;
+            };
+            for (size_t x = 0; x <= edge; ++x) {
+                for (size_t y = 0; y <= edge; ++y) {
+                    for (size_t z = 0; z <= edge; ++z) {
+                        const size_t vertex =
+                            ((static_cast<size_t>(inBrick[0]) + x) * ExtinctionField::kBrickEdge +
+                             static_cast<size_t>(inBrick[1]) + y) *
+                                ExtinctionField::kBrickEdge +
+                            static_cast<size_t>(inBrick[2]) + z;
+                        const float density = constant ? field_.constant(entry)[channel]
+                                                       : field_.vertex(entry, vertex, channel);
+                        const double residual =
+                            static_cast<double>(density) -
+                            control.at({{unit(0, x), unit(1, y), unit(2, z)}});
+                        const double weight =
+                            trapezoid(x, edge) * trapezoid(y, edge) * trapezoid(z, edge);
+                        majorant = std::max(majorant, std::fabs(residual));
+                        squares += weight * residual * residual;
+                    }
+                }
+            }
+        });
+        // Whoever evaluates the control again may round differently.
+        const double rounding = 1e-15 * (static_cast<double>(v.max) + control.max());
+        v.majorant = roundUp(majorant + rounding);
+        v.rms = std::min(roundUp(std::sqrt(squares / std::pow(size_, 3)) + rounding), v.majorant);
     }
 
     const ExtinctionField& field_;
+    ControlKind kind_;
+    size_t channels_;
     int size_;
     int cube_;
     int shift_ = 0;
     std::vector<Moments> cubes_;
+    SparseTable plan_;
+    std::vector<Int3> jobs_;         // origins, local
+    std::vector<Moments> moments_;   // of each job and channel
+    std::vector<size_t> itemJobs_;   // the job that each item of the bake is of
+    BakedVolume baked_;
 };
 
-/// Means of the super-voxels twice as large as those of `finer`.
+/// Means of the super-voxels twice as large as those of `finer`. `meanOf(index, channel)`.
 template <class MeanOf>
-ScalarTable nextLevel(const SparseTable& finer, const trk::IntBox& box, const MeanOf& meanOf) {
-    ScalarTable level;
+ValueTable nextLevel(const SparseTable& finer, const trk::IntBox& box, size_t channels,
+                     const MeanOf& meanOf) {
+    ValueTable level;
     const int shift = finer.itemShift() + 1;
     const int64_t half = int64_t{1} << finer.itemShift();
     level.table = SparseTable(shift, box);
-    std::unordered_map<float, SparseTable::Entry> known;
-    const auto add = [&](float mean) {
-        if (mean == 0) {
+    using Mean = std::array<float, 3>;
+    std::map<Mean, SparseTable::Entry> known;
+    const auto add = [&](const Mean& mean) {
+        if (mean == Mean{}) {
             return SparseTable::kEmpty;
         }
-        const auto [it, isNew] =
-            known.try_emplace(mean, static_cast<SparseTable::Entry>(level.values.size() + 1));
+        const auto [it, isNew] = known.try_emplace(
+            mean, static_cast<SparseTable::Entry>(level.values.size() / channels + 1));
         if (isNew) {
-            level.values.push_back(mean);
+            level.values.insert(level.values.end(), mean.begin(),
+                                mean.begin() + static_cast<std::ptrdiff_t>(channels));
         }
         return it->second;
     };
@@ -255,19 +583,29 @@ ScalarTable nextLevel(const SparseTable& finer, const trk::IntBox& box, const Me
             if (!entry) {
                 return std::nullopt;
             }
-            return *entry == SparseTable::kEmpty ? SparseTable::kEmpty : add(meanOf(*entry));
+            Mean mean{};
+            for (size_t c = 0; c < channels && *entry != SparseTable::kEmpty; ++c) {
+                mean[c] = meanOf(SparseTable::index(*entry), c);
+            }
+            return add(mean);
         },
         [&](const Int3& origin) {
-            double sum = 0;
+            double sum[3] = {0, 0, 0};
             for (int64_t octant = 0; octant < 8; ++octant) {
                 const auto entry =
                     finer
                         .find(origin[0] + (octant >> 2) * half,
                               origin[1] + (octant >> 1 & 1) * half, origin[2] + (octant & 1) * half)
                         .entry;
-                sum += entry == SparseTable::kEmpty ? 0 : static_cast<double>(meanOf(entry));
+                for (size_t c = 0; c < channels && entry != SparseTable::kEmpty; ++c) {
+                    sum[c] += static_cast<double>(meanOf(SparseTable::index(entry), c));
+                }
             }
-            return add(static_cast<float>(sum / 8));
+            Mean mean{};
+            for (size_t c = 0; c < channels; ++c) {
+                mean[c] = static_cast<float>(sum[c] / 8);
+            }
+            return add(mean);
         },
         [&](const Int3& origin, int regionShift, SparseTable::Key& key) {
             return finer.appendKey(origin, regionShift, key);
@@ -277,21 +615,54 @@ ScalarTable nextLevel(const SparseTable& finer, const trk::IntBox& box, const Me
 
 }  // namespace
 
-BakedVolume bake(const ExtinctionField& field, int superVoxelSize, int levels) {
-    BakedVolume baked = Baker(field, superVoxelSize).bake();
-    for (int i = 0; i < levels; ++i) {
+BakedVolume bake(const ExtinctionField& field, const BakeOptions& options) {
+    BakedVolume baked = Baker(field, options).bake();
+    const size_t channels = baked.channels;
+    for (int i = 0; i < options.levels; ++i) {
         if (i == 0) {
-            baked.levels.push_back(nextLevel(baked.table, field.box(), [&](SparseTable::Entry e) {
-                return baked.items[e - 1].control;
-            }));
+            baked.levels.push_back(
+                nextLevel(baked.table, field.box(), channels, [&](size_t item, size_t c) {
+                    return baked.items[item * channels + c].mean;
+                }));
         } else {
-            const ScalarTable& finer = baked.levels.back();
-            baked.levels.push_back(nextLevel(finer.table, field.box(), [&](SparseTable::Entry e) {
-                return finer.values[e - 1];
-            }));
+            const ValueTable& finer = baked.levels.back();
+            baked.levels.push_back(
+                nextLevel(finer.table, field.box(), channels, [&](size_t item, size_t c) {
+                    return finer.values[item * channels + c];
+                }));
         }
     }
     return baked;
+}
+
+ControlFit measureFit(const BakedVolume& baked) {
+    double count = 0;
+    double squares[3] = {0, 0, 0};  // of residual, deviation, density
+    double mass[2] = {0, 0};        // of control, density
+    baked.table.forEach([&](const Int3&, int shift, SparseTable::Entry entry) {
+        const double n = std::pow(8.0, shift - baked.superVoxelShift);  // super-voxels
+        for (size_t c = 0; c < baked.channels; ++c) {
+            const size_t item = SparseTable::index(entry) * baked.channels + c;
+            const BakedSuperVoxel& v = baked.items[item];
+            const auto square = [](float x) {
+                return static_cast<double>(x) * static_cast<double>(x);
+            };
+            count += n;
+            squares[0] += n * square(v.rms);
+            squares[1] += n * square(v.deviation);
+            squares[2] += n * (square(v.deviation) + square(v.mean));
+            mass[0] += n * baked.control(item).centre;  // the mean of any multilinear control
+            mass[1] += n * static_cast<double>(v.mean);
+        }
+    });
+    ControlFit fit;
+    if (count > 0) {
+        fit.residualRms = std::sqrt(squares[0] / count);
+        fit.constantRms = std::sqrt(squares[1] / count);
+        fit.fieldRms = std::sqrt(squares[2] / count);
+        fit.massRatio = mass[0] / mass[1];
+    }
+    return fit;
 }
 
 }  // namespace vdbtools

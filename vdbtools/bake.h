@@ -1,5 +1,5 @@
 // SPDX-License-Identifier: Apache-2.0
-// Statistics, constant control and preview levels of a density: what a sidecar stores.
+// Statistics, control and preview levels of a density: what a sidecar stores.
 #pragma once
 
 #include "extinction_field.h"
@@ -7,9 +7,23 @@
 
 namespace vdbtools {
 
-/// Bakes a field, in parallel. `superVoxelSize`: a power of two from 4 to 64, in voxels. `levels`:
-/// preview levels, each of super-voxels twice as large. The result has the same bits for any number
-/// of threads, and with or without tiles in the source.
-trk::BakedVolume bake(const trk::ExtinctionField& field, int superVoxelSize, int levels);
+struct BakeOptions {
+    int superVoxelSize = 16;  ///< a power of two from 4 to 64, in voxels
+    int levels = 4;           ///< preview levels, each of super-voxels twice as large
+    trk::ControlKind kind = trk::ControlKind::kConstant;
+};
+
+/// Bakes a field, in parallel. The result has the same bits for any number of threads, and with or
+/// without tiles in the source.
+trk::BakedVolume bake(const trk::ExtinctionField& field, const BakeOptions& options);
+
+/// How well a bake's control fits, over all occupied super-voxels and channels.
+struct ControlFit {
+    double residualRms = 0;  ///< root mean square of density - control (an upper bound)
+    double constantRms = 0;  ///< what a constant control would leave
+    double fieldRms = 0;     ///< of the density itself
+    double massRatio = 1;    ///< the control's mass over the density's
+};
+ControlFit measureFit(const trk::BakedVolume& baked);
 
 }  // namespace vdbtools

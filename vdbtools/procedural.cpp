@@ -1,6 +1,7 @@
 // SPDX-License-Identifier: Apache-2.0
 #include "procedural.h"
 
+#include "io/density_types.h"
 #include "io/vdb_writer.h"
 #include "math.h"
 
@@ -105,13 +106,14 @@ class Noise {
     std::array<uint8_t, 256> permutation_{};
 };
 
-/// A density on the unit cube, y up.
+/// A density on the unit cube, y up, of one channel or three.
 class Shape {
   public:
     virtual ~Shape() = default;
+    virtual bool coloured() const { return false; }
     /// Whether the density is 0 within `radius` of `centre`; may answer false too often.
     virtual bool emptyAround(const Vec3d& centre, double radius) const = 0;
-    virtual double density(const Vec3d& p) const = 0;
+    virtual double density(const Vec3d& p, int channel) const = 0;
 };
 
 class Cloud : public Shape {
@@ -150,9 +152,12 @@ class Cloud : public Shape {
         });
     }
 
-    double density(const Vec3d& p) const override {
-        const Vec3d low{{noise_(5.0 * p), noise_(5.0 * p + Vec3d{{40, 0, 0}}),
-                         noise_(5.0 * p + Vec3d{{0, 40, 0}})}};
+    double density(const Vec3d& p, int) const override { return densityOf(p, {}); }
+
+    /// `variant`: where in the noise its detail and outline come from.
+    double densityOf(const Vec3d& p, const Vec3d& variant) const {
+        const Vec3d w = 5.0 * p + variant;
+        const Vec3d low{{noise_(w), noise_(w + Vec3d{{40, 0, 0}}), noise_(w + Vec3d{{0, 40, 0}})}};
         const Vec3d q = p + 0.6 * kWarp * low;
         // Depth below the surface of the nearest ball, in radii; smaller balls keep finer detail.
         double depth = -1;
@@ -162,7 +167,7 @@ class Cloud : public Shape {
         if (depth < 1 - kReach) {
             return 0;
         }
-        const double detail = noise_.billows(9.0 * p, 6, 0.55);
+        const double detail = noise_.billows(9.0 * p + variant, 6, 0.55);
         const double base = smoothStep(0.24, 0.3, p[1] + 0.02 * low[0]);
         const double shaped = depth + 0.62 * (detail - 0.62) - 0.35 * (1 - base);
         return smoothStep(0.0, 0.16, shaped) * (0.55 + 0.45 * smoothStep(0.3, 0.8, detail));
@@ -180,6 +185,28 @@ class Cloud : public Shape {
     std::vector<Ball> balls_;
 };
 
+/// Three clouds of one skeleton, say droplets of three sizes: each has an outline and detail of its
+/// own, and is denser in other parts.
+class ColorCloud : public Shape {
+  public:
+    explicit ColorCloud(uint64_t seed) : cloud_(seed), noise_(seed * 31 + 7) {}
+
+    bool coloured() const override { return true; }
+    bool emptyAround(const Vec3d& centre, double radius) const override {
+        return cloud_.emptyAround(centre, radius);
+    }
+    double density(const Vec3d& p, int channel) const override {
+        const Vec3d variant{{61.0 * channel, 23.0 * channel, 0}};
+        const double where = noise_.octaves(2.6 * p + variant, 2, 0.4);
+        const double share = 0.15 + 0.85 * smoothStep(-0.22, 0.22, where);
+        return share * cloud_.densityOf(p, variant);
+    }
+
+  private:
+    Cloud cloud_;
+    Noise noise_;
+};
+
 class Smoke : public Shape {
   public:
     explicit Smoke(uint64_t seed) : noise_(seed) {}
@@ -193,7 +220,7 @@ class Smoke : public Shape {
                std::sqrt(x * x + z * z) - radius > 1.6 * width(std::min(hi, 1.0)) + drift(hi);
     }
 
-    double density(const Vec3d& p) const override {
+    double density(const Vec3d& p, int) const override {
         const double height = std::max(p[1], 0.0);
         // Rising air folds what it carries: warp the plume by noise that grows with height, twice.
         const Vec3d slow{{2.2 * p[0], 1.5 * p[1], 2.2 * p[2]}};
@@ -235,25 +262,41 @@ std::unique_ptr<Shape> makeShape(const ProceduralOptions& options) {
     if (options.kind == "smoke") {
         return std::make_unique<Smoke>(options.seed);
     }
+    if (options.kind == "color-cloud") {
+        return std::make_unique<ColorCloud>(options.seed);
+    }
     return std::make_unique<Cloud>(options.seed);
 }
 
-}  // namespace
-
-const std::vector<std::string>& proceduralKinds() {
-    static const std::vector<std::string> kinds{"cloud", "smoke"};
-    return kinds;
-}
-
-ProceduralSummary writeProcedural(const ProceduralOptions& options, const trk::OutputFile& file,
-                                  const std::function<void(double)>& progress) {
-    using Leaf = openvdb::FloatTree::LeafNodeType;
-    openvdb::initialize();
-    const std::unique_ptr<Shape> shape = makeShape(options);
-    const double voxel = 1.0 / options.voxels;  // in the unit cube
-    const int blocks = (options.voxels + 7) / 8;
+/// The shape as a grid, leaf by leaf.
+template <class GridType>
+typename GridType::Ptr makeGrid(const Shape& shape, int voxels,
+                                const std::function<void(double)>& progress) {
+    using Value = typename GridType::ValueType;
+    using Leaf = typename GridType::TreeType::LeafNodeType;
+    const double voxel = 1.0 / voxels;  // in the unit cube
+    const int blocks = (voxels + 7) / 8;
     std::vector<std::unique_ptr<Leaf>> leaves(
         static_cast<size_t>(blocks) * static_cast<size_t>(blocks) * static_cast<size_t>(blocks));
+    const auto fill = [&](Leaf& leaf) {
+        for (openvdb::Index i = 0; i < Leaf::SIZE; ++i) {
+            const openvdb::Coord at = leaf.offsetToGlobalCoord(i);
+            if (std::max({at.x(), at.y(), at.z()}) >= voxels) {
+                continue;
+            }
+            const Vec3d p{{(at.x() + 0.5) * voxel, (at.y() + 0.5) * voxel, (at.z() + 0.5) * voxel}};
+            trk::Sample<Value> sample{};
+            bool any = false;
+            for (size_t c = 0; c < sample.size(); ++c) {
+                const double d = shape.density(p, static_cast<int>(c));
+                sample[c] = d > kLeast ? static_cast<float>(d) : 0.0f;
+                any = any || d > kLeast;
+            }
+            if (any) {
+                leaf.setValueOn(i, trk::fromFloats<Value>(sample.data()));
+            }
+        }
+    };
     std::atomic<int> done{0};
     tbb::parallel_for(tbb::blocked_range<int>(0, blocks * blocks), [&](const auto& range) {
         for (int column = range.begin(); column != range.end(); ++column) {
@@ -261,19 +304,11 @@ ProceduralSummary writeProcedural(const ProceduralOptions& options, const trk::O
                 const openvdb::Coord origin(8 * (column / blocks), 8 * (column % blocks), 8 * k);
                 const Vec3d centre{
                     {(origin.x() + 4) * voxel, (origin.y() + 4) * voxel, (origin.z() + 4) * voxel}};
-                if (shape->emptyAround(centre, 7 * voxel)) {
+                if (shape.emptyAround(centre, 7 * voxel)) {
                     continue;
                 }
-                auto leaf = std::make_unique<Leaf>(origin, 0.0f);
-                for (openvdb::Index i = 0; i < Leaf::SIZE; ++i) {
-                    const openvdb::Coord at = leaf->offsetToGlobalCoord(i);
-                    const double d = shape->density(
-                        {{(at.x() + 0.5) * voxel, (at.y() + 0.5) * voxel, (at.z() + 0.5) * voxel}});
-                    const bool inside = std::max({at.x(), at.y(), at.z()}) < options.voxels;
-                    if (inside && d > kLeast) {
-                        leaf->setValueOn(i, static_cast<float>(d));
-                    }
-                }
+                auto leaf = std::make_unique<Leaf>(origin, openvdb::zeroVal<Value>());
+                fill(*leaf);
                 if (!leaf->isEmpty()) {
                     leaves[static_cast<size_t>(column) * static_cast<size_t>(blocks) +
                            static_cast<size_t>(k)] = std::move(leaf);
@@ -282,11 +317,31 @@ ProceduralSummary writeProcedural(const ProceduralOptions& options, const trk::O
             progress(static_cast<double>(++done) / (blocks * blocks));
         }
     });
-    auto grid = openvdb::FloatGrid::create();
+    auto grid = GridType::create();
     for (auto& leaf : leaves) {
         if (leaf) {
             grid->tree().addLeaf(leaf.release());
         }
+    }
+    return grid;
+}
+
+}  // namespace
+
+const std::vector<std::string>& proceduralKinds() {
+    static const std::vector<std::string> kinds{"cloud", "smoke", "color-cloud"};
+    return kinds;
+}
+
+ProceduralSummary writeProcedural(const ProceduralOptions& options, const trk::OutputFile& file,
+                                  const std::function<void(double)>& progress) {
+    openvdb::initialize();
+    const std::unique_ptr<Shape> shape = makeShape(options);
+    openvdb::GridBase::Ptr grid;
+    if (shape->coloured()) {
+        grid = makeGrid<openvdb::Vec3SGrid>(*shape, options.voxels, progress);
+    } else {
+        grid = makeGrid<openvdb::FloatGrid>(*shape, options.voxels, progress);
     }
     ProceduralSummary summary;
     summary.voxelSize = kBoxSize / options.voxels;

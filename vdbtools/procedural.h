@@ -11,7 +11,8 @@
 
 namespace vdbtools {
 
-/// "cloud": a cumulus, dense inside, crisp outside. "smoke": a thin rising plume.
+/// "cloud": a cumulus, dense inside, crisp outside. "smoke": a thin rising plume. "color-cloud": a
+/// cumulus whose three channels differ in shape.
 const std::vector<std::string>& proceduralKinds();
 
 struct ProceduralOptions {
@@ -25,7 +26,7 @@ struct ProceduralSummary {
     double voxelSize = 0;  ///< the box is 10 world units wide
 };
 
-/// Writes grid "density" (float, fog volume, values from 0 to 1) to `file`, without committing it.
+/// Writes grid "density" (float or Vec3s, fog volume, values from 0 to 1) to `file`, without committing it.
 /// `progress(fraction)` is called now and then. The same options give the same voxels on any number
 /// of threads.
 ProceduralSummary writeProcedural(const ProceduralOptions& options, const trk::OutputFile& file,

@@ -1,12 +1,15 @@
 // SPDX-License-Identifier: Apache-2.0
 #include "verify.h"
 
+#include "io/density_types.h"
 #include "io/tree_regions.h"
 #include "io/vdb_file.h"
 
 #include <tbb/blocked_range.h>
 #include <tbb/parallel_for.h>
 
+#include <algorithm>
+#include <array>
 #include <atomic>
 #include <cmath>
 #include <optional>
@@ -30,6 +33,7 @@ template <class TreeType>
 class Verifier {
   public:
     using Regions = trk::TreeRegions<TreeType>;
+    using Sample = trk::Sample<typename TreeType::ValueType>;
 
     Verifier(const TreeType& tree, const trk::Sidecar& sidecar)
         : tree_(tree), sidecar_(sidecar), size_(sidecar.baked.superVoxelSize()) {}
@@ -38,7 +42,7 @@ class Verifier {
         VerifyReport report;
         std::vector<Place> places;
         sidecar_.baked.table.forEach([&](const Int3& local, int shift, SparseTable::Entry entry) {
-            addPlaces(toIndex(local), shift, entry - 1, places);
+            addPlaces(toIndex(local), shift, SparseTable::index(entry) * kChannels, places);
         });
         report.superVoxels = sidecar_.baked.table.occupiedItems();
         std::atomic<uint64_t> vertices{0};
@@ -73,13 +77,23 @@ class Verifier {
     struct Place {
         Int3 origin;
         int shift;
-        size_t item;
+        size_t item;  // of its first channel, in the bake's items
     };
+
+    static constexpr size_t kChannels = std::tuple_size_v<Sample>;
+
+    bool isHomogeneous(size_t item) const {
+        bool homogeneous = true;
+        for (size_t c = 0; c < kChannels; ++c) {
+            const BakedSuperVoxel& v = sidecar_.baked.items[item + c];
+            homogeneous = homogeneous && v.min == v.max;
+        }
+        return homogeneous;
+    }
 
     /// A region of equal super-voxels is one place if they claim to be constant, else one each.
     void addPlaces(const Int3& origin, int shift, size_t item, std::vector<Place>& places) const {
-        const BakedSuperVoxel& v = sidecar_.baked.items[item];
-        if (v.min == v.max || shift == sidecar_.baked.superVoxelShift) {
+        if (isHomogeneous(item) || shift == sidecar_.baked.superVoxelShift) {
             places.push_back({origin, shift, item});
             return;
         }
@@ -111,56 +125,90 @@ class Verifier {
         return first;
     }
 
-    float vertex(Regions& regions, const Int3& at) const {
-        const auto v = static_cast<float>(regions.value(at));
-        return v > 0 && std::isfinite(v) ? v : 0.0f;  // repaired, where the sidecar says so
+    /// Repaired, where the sidecar says so.
+    static Sample vertex(Regions& regions, const Int3& at) {
+        return trk::fieldValue(regions.value(at));
     }
 
     std::string checkPlace(Regions& regions, const Place& place, uint64_t& vertices) const {
-        const BakedSuperVoxel& item = sidecar_.baked.items[place.item];
         const int64_t edge = int64_t{1} << place.shift;
         if (edge > size_) {
-            return checkUniform(regions, place, item, vertices);
+            return checkUniform(regions, place, vertices);
         }
-        double sum = 0;
-        double squares = 0;
+        const auto controls = controlsOf(place);
+        double sum[kChannels] = {};
+        double squares[kChannels] = {};
+        double deviations[kChannels] = {};
         const auto weight = [&](int64_t i) { return i == 0 || i == edge ? 0.5 : 1.0; };
         for (int64_t x = 0; x <= edge; ++x) {
             for (int64_t y = 0; y <= edge; ++y) {
                 for (int64_t z = 0; z <= edge; ++z) {
                     const Int3 at{{place.origin[0] + x, place.origin[1] + y, place.origin[2] + z}};
-                    const float v = vertex(regions, at);
+                    const Sample sample = vertex(regions, at);
                     ++vertices;
-                    const std::string wrong = checkVertex(item, place, at, v);
-                    if (!wrong.empty()) {
-                        return wrong;
-                    }
                     const double w = weight(x) * weight(y) * weight(z);
-                    const double residual =
-                        static_cast<double>(v) - static_cast<double>(item.control);
-                    sum += w * static_cast<double>(v);
-                    squares += w * residual * residual;
+                    for (size_t c = 0; c < kChannels; ++c) {
+                        const double control = controls[c].at({{unit(x), unit(y), unit(z)}});
+                        std::string wrong = checkVertex(place, c, at, sample[c], control);
+                        if (!wrong.empty()) {
+                            return wrong;
+                        }
+                        const auto v = static_cast<double>(sample[c]);
+                        const double deviation =
+                            v - static_cast<double>(sidecar_.baked.items[place.item + c].mean);
+                        sum[c] += w * v;
+                        squares[c] += w * (v - control) * (v - control);
+                        deviations[c] += w * deviation * deviation;
+                    }
                 }
             }
         }
         const auto cells = static_cast<double>(edge * edge * edge);
-        const double mean = sum / cells;
-        const double rms = std::sqrt(squares / cells);
-        const double control = static_cast<double>(item.control);
+        for (size_t c = 0; c < kChannels; ++c) {
+            std::string wrong = checkSums(place, c, sum[c] / cells, std::sqrt(squares[c] / cells),
+                                          std::sqrt(deviations[c] / cells));
+            if (!wrong.empty()) {
+                return wrong;
+            }
+        }
+        return {};
+    }
+
+    double unit(int64_t x) const {
+        return static_cast<double>(x) / static_cast<double>(size_) - 0.5;
+    }
+
+    std::array<trk::ControlPolynomial<double>, kChannels> controlsOf(const Place& place) const {
+        std::array<trk::ControlPolynomial<double>, kChannels> controls;
+        for (size_t c = 0; c < kChannels; ++c) {
+            controls[c] = sidecar_.baked.control(place.item + c);
+        }
+        return controls;
+    }
+
+    std::string checkSums(const Place& place, size_t channel, double mean, double rms,
+                          double deviation) const {
+        const BakedSuperVoxel& item = sidecar_.baked.items[place.item + channel];
         std::ostringstream line;
         // Float rounding, plus that of summing in another order than the bake.
-        if (std::fabs(control - mean) > 1e-6 * mean + 1e-38) {
-            line << name(place) << ": control " << item.control << ", but the mean is " << mean;
-        } else if (rms > static_cast<double>(item.rms) * (1 + 1e-6) + 1e-7 * mean + 1e-38) {
-            line << name(place) << ": RMS " << item.rms << ", but it is " << rms;
+        const auto exceeds = [&](double found, float claimed) {
+            return found > static_cast<double>(claimed) * (1 + 1e-6) + 1e-7 * mean + 1e-38;
+        };
+        if (std::fabs(static_cast<double>(item.mean) - mean) > 1e-6 * mean + 1e-38) {
+            line << name(place, channel) << ": mean " << item.mean << ", but it is " << mean;
+        } else if (exceeds(rms, item.rms)) {
+            line << name(place, channel) << ": RMS " << item.rms << ", but it is " << rms;
+        } else if (exceeds(deviation, item.deviation)) {
+            line << name(place, channel) << ": deviation " << item.deviation << ", but it is "
+                 << deviation;
         }
         return line.str();
     }
 
     /// A place larger than a super-voxel claims one value everywhere, faces included.
-    std::string checkUniform(Regions& regions, const Place& place, const BakedSuperVoxel& item,
-                             uint64_t& vertices) const {
+    std::string checkUniform(Regions& regions, const Place& place, uint64_t& vertices) const {
         const int64_t edge = int64_t{1} << place.shift;
+        const auto controls = controlsOf(place);
         std::string wrong;
         const IntBox closed{
             place.origin,
@@ -170,11 +218,16 @@ class Verifier {
             const Int3 origin{{place.origin[0] + (corner & 4 ? edge : 0),
                                place.origin[1] + (corner & 2 ? edge : 0),
                                place.origin[2] + (corner & 1 ? edge : 0)}};
-            forEachRegion(regions, origin, place.shift, closed, [&](const Int3& at, float value) {
-                ++vertices;
-                wrong = checkVertex(item, place, at, value);
-                return wrong.empty();
-            });
+            forEachRegion(regions, origin, place.shift, closed,
+                          [&](const Int3& at, const Sample& sample) {
+                              ++vertices;
+                              for (size_t c = 0; c < kChannels && wrong.empty(); ++c) {
+                                  // Homogeneous: its control is its centre's everywhere.
+                                  wrong =
+                                      checkVertex(place, c, at, sample[c], controls[c].centre);
+                              }
+                              return wrong.empty();
+                          });
         }
         return wrong;
     }
@@ -209,28 +262,41 @@ class Verifier {
         return true;
     }
 
-    std::string name(const Place& place) const {
+    std::string name(const Place& place, size_t channel) const {
         std::ostringstream text;
         text << "super-voxel "
              << Int3{{place.origin[0] / size_, place.origin[1] / size_, place.origin[2] / size_}};
+        if (kChannels > 1) {
+            text << " channel " << channel;
+        }
         return text.str();
     }
 
-    std::string checkVertex(const BakedSuperVoxel& item, const Place& place, const Int3& at,
-                            float v) const {
-        std::ostringstream line;
-        const auto report = [&](const char* bound, float value) {
-            line << name(place) << ": " << bound << " " << value << ", but voxel " << at << " is "
-                 << v;
-        };
-        line.precision(9);
-        const double residual = static_cast<double>(v) - static_cast<double>(item.control);
+    std::string checkVertex(const Place& place, size_t channel, const Int3& at, float v,
+                            double control) const {
+        const BakedSuperVoxel& item = sidecar_.baked.items[place.item + channel];
+        const char* bound = nullptr;
+        float value = 0;
+        const double residual = static_cast<double>(v) - control;
         if (v < item.min) {
-            report("min", item.min);
+            bound = "min";
+            value = item.min;
         } else if (v > item.max) {
-            report("max", item.max);
+            bound = "max";
+            value = item.max;
         } else if (std::fabs(residual) > static_cast<double>(item.majorant)) {
-            report("majorant", item.majorant);
+            bound = "majorant";
+            value = item.majorant;
+        }
+        if (!bound) {
+            return {};
+        }
+        std::ostringstream line;
+        line.precision(9);
+        line << name(place, channel) << ": " << bound << " " << value << ", but voxel " << at
+             << " is " << v;
+        if (sidecar_.baked.kind != trk::ControlKind::kConstant) {
+            line << " and the control there " << control;
         }
         return line.str();
     }
@@ -244,14 +310,18 @@ class Verifier {
             add(leaf->origin(), 8);
         }
         auto tile = tree_.cbeginValueAll();
-        tile.setMaxDepth(openvdb::FloatTree::ValueAllCIter::LEAF_DEPTH - 1);
+        tile.setMaxDepth(TreeType::ValueAllCIter::LEAF_DEPTH - 1);
         for (; tile; ++tile) {
-            if (!(tile.getValue() == 0)) {
+            if (!(tile.getValue() == openvdb::zeroVal<typename TreeType::ValueType>())) {
                 openvdb::CoordBBox box;
                 tile.getBoundingBox(box);
                 add(box.min(), box.dim().x());
             }
         }
+    }
+
+    static float largest(const Sample& sample) {
+        return *std::max_element(sample.begin(), sample.end());
     }
 
     /// Every super-voxel that a voxel above 0 belongs to must be occupied.
@@ -263,7 +333,7 @@ class Verifier {
                  << " is " << v;
         };
         if (edge > 8) {  // a tile
-            const float v = vertex(regions, block.lo);
+            const float v = largest(vertex(regions, block.lo));
             IntBox touched;
             for (size_t a = 0; a < 3; ++a) {
                 touched.lo[a] = (block.lo[a] - 1 - sidecar_.anchor[a]) & ~(size_ - 1);
@@ -279,7 +349,7 @@ class Verifier {
         for (int64_t i = 0; i < 512; ++i) {
             const Int3 at{
                 {block.lo[0] + (i >> 6), block.lo[1] + (i >> 3 & 7), block.lo[2] + (i & 7)}};
-            const float v = vertex(regions, at);
+            const float v = largest(vertex(regions, at));
             for (int corner = 0; v > 0 && corner < 8; ++corner) {
                 Int3 cell = at;
                 for (size_t a = 0; a < 3; ++a) {
@@ -327,10 +397,10 @@ VerifyReport verify(const trk::DensitySummary& density, const trk::Sidecar& side
     const trk::VdbEntry& entry =
         file.select(density.grid.name + "[" + std::to_string(density.grid.index) + "]");
     const openvdb::GridBase::Ptr grid = file.read(entry);
-    if (density.valueType == "double") {
-        return Verifier(static_cast<const openvdb::DoubleGrid&>(*grid).constTree(), sidecar).run();
-    }
-    return Verifier(static_cast<const openvdb::FloatGrid&>(*grid).constTree(), sidecar).run();
+    VerifyReport report;
+    grid->apply<trk::DensityGrids>(
+        [&](const auto& typed) { report = Verifier(typed.constTree(), sidecar).run(); });
+    return report;
 }
 
 }  // namespace vdbtools

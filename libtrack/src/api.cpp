@@ -68,6 +68,11 @@ trk::VolumeOptions checked(const TrkVolumeOptions& options) {
     if (!(options.scale >= 0) || !std::isfinite(options.scale)) {
         refuse("scale is " + std::to_string(options.scale) + "; expected a finite number >= 0");
     }
+    for (const float color : options.color) {
+        if (!(color >= 0) || !std::isfinite(color)) {
+            refuse("color is " + std::to_string(color) + "; expected finite numbers >= 0");
+        }
+    }
     if (options.choice < TRK_CHOICE_ROBUST || options.choice > TRK_CHOICE_MAX) {
         refuse("choice is " + std::to_string(options.choice) + "; expected a TRK_CHOICE_ constant");
     }
@@ -84,6 +89,7 @@ trk::VolumeOptions checked(const TrkVolumeOptions& options) {
     result.gridNamed = options.gridName != nullptr;
     result.gridName = options.gridName ? options.gridName : "";
     result.scale = options.scale;
+    std::copy_n(options.color, 3, result.color.begin());
     result.choice = options.choice;
     result.check = options.check;
     result.repair = options.repair;
@@ -222,7 +228,7 @@ TrkStatus trkGetVolumeInfo(const TrkVolume* handle, TrkVolumeInfo* info) {
         }
         result.activeVoxels = volume.activeVoxels;
         result.bytes = volume.bytes();
-        result.channels = 1;
+        result.channels = static_cast<uint32_t>(volume.channels());
         result.hasDensity = volume.hasDensity ? 1 : 0;
         result.gridName = volume.grid.name.c_str();
         result.controlKind = "";
@@ -231,7 +237,7 @@ TrkStatus trkGetVolumeInfo(const TrkVolume* handle, TrkVolumeInfo* info) {
             result.superVoxelSize = static_cast<uint32_t>(volume.superVoxels.size());
             result.superVoxelCount = volume.superVoxels.count();
             result.levels = static_cast<uint32_t>(volume.superVoxels.levelCount());
-            result.controlKind = "constant";
+            result.controlKind = trk::controlName(volume.superVoxels.kind());
         }
         *info = result;
     });

@@ -5,9 +5,10 @@
 
 namespace trk {
 
-ExtinctionField::ExtinctionField(SparseTable table, std::vector<float> constants,
+ExtinctionField::ExtinctionField(size_t channels, SparseTable table, std::vector<float> constants,
                                  std::vector<float> floats, std::vector<uint16_t> halfs)
-    : table_(std::move(table)),
+    : channels_(channels),
+      table_(std::move(table)),
       constants_(std::move(constants)),
       floats_(std::move(floats)),
       halfs_(std::move(halfs)),
@@ -18,17 +19,11 @@ size_t ExtinctionField::bytes() const {
            floats_.capacity() * sizeof(float) + halfs_.capacity() * sizeof(uint16_t);
 }
 
-void ExtinctionField::copyBrick(Entry entry, float (&out)[kBrickVertices]) const {
-    const size_t first = (entry - 1) * kBrickVertices;
-    for (size_t i = 0; i < kBrickVertices; ++i) {
-        out[i] = isHalf() ? decodeHalf(halfs_[first + i]) : floats_[first + i];
-    }
-}
-
-template <class Stored>
-double ExtinctionField::integrateBrick(const Stored* brick, const Int3& lo, const LocalRay& ray,
-                                       double t0, double t1, uint64_t& lookups) {
-    constexpr std::ptrdiff_t kStride[3] = {81, 9, 1};
+template <size_t C, class Stored>
+void ExtinctionField::integrateBrick(const Stored* brick, const Int3& lo, const LocalRay& ray,
+                                     double t0, double t1, uint64_t& lookups,
+                                     std::array<double, C>& sum) {
+    constexpr std::ptrdiff_t kStride[3] = {81 * C, 9 * C, C};
     constexpr double kGauss = 0.57735026918962576451;  // 1/sqrt(3)
     double origin[3];
     double cellOrigin[3];  // of the current cell: integers, as doubles
@@ -47,7 +42,6 @@ double ExtinctionField::integrateBrick(const Stored* brick, const Int3& lo, cons
         corner += cell * kStride[a];
         tPlane[a] = (cell + (backwards ? 0 : 1) - origin[a]) * ray.inverse[a];
     }
-    double sum = 0;
     double t = t0;
     for (;;) {
         int axis = tPlane[0] < tPlane[1] ? 0 : 1;
@@ -64,18 +58,21 @@ double ExtinctionField::integrateBrick(const Stored* brick, const Int3& lo, cons
         }
         // In double: near the far face of a cell next to empty space the value is the small
         // difference between 1 and the fraction.
-        const Corners<double> corners(corner);
-        sum += half * (interpolate<double>(corners, centre[0] - offset[0], centre[1] - offset[1],
-                                           centre[2] - offset[2]) +
-                       interpolate<double>(corners, centre[0] + offset[0], centre[1] + offset[1],
-                                           centre[2] + offset[2]));
+        for (size_t c = 0; c < C; ++c) {
+            const Corners<double, C> corners(corner + c);
+            sum[c] +=
+                half * (interpolate<double>(corners, centre[0] - offset[0], centre[1] - offset[1],
+                                            centre[2] - offset[2]) +
+                        interpolate<double>(corners, centre[0] + offset[0], centre[1] + offset[1],
+                                            centre[2] + offset[2]));
+        }
         lookups += 2;
         if (last) {
-            return sum;
+            return;
         }
         cellOrigin[axis] += planeStep[axis];
         if (cellOrigin[axis] < 0 || cellOrigin[axis] > 7) {
-            return sum;
+            return;
         }
         corner += stride[axis];
         const double plane = cellOrigin[axis] + (planeStep[axis] > 0 ? 1 : 0);
@@ -84,21 +81,37 @@ double ExtinctionField::integrateBrick(const Stored* brick, const Int3& lo, cons
     }
 }
 
-double ExtinctionField::integrate(const LocalRay& ray, double t0, double t1, uint64_t& lookups,
-                                  uint64_t& regions) const {
-    double sum = 0;
+template <size_t C>
+std::array<double, C> ExtinctionField::integrate(const LocalRay& ray, double t0, double t1,
+                                                 uint64_t& lookups, uint64_t& regions) const {
+    std::array<double, C> sum{};
     table_.walk(ray, t0, t1, [&](Entry entry, const Int3& lo, int, double tEnter, double tExit) {
         ++regions;
         if (isConstant(entry)) {
-            sum += constant(entry) * (tExit - tEnter);
+            for (size_t c = 0; c < C; ++c) {
+                sum[c] += static_cast<double>(constant(entry)[c]) * (tExit - tEnter);
+            }
+            return true;
+        }
+        // Summed apart, so that it stays in registers.
+        std::array<double, C> part{};
+        const size_t first = (entry - 1) * kBrickVertices * C;
+        if (isHalf()) {
+            integrateBrick<C>(&halfs_[first], lo, ray, tEnter, tExit, lookups, part);
         } else {
-            const size_t first = (entry - 1) * kBrickVertices;
-            sum += isHalf() ? integrateBrick(&halfs_[first], lo, ray, tEnter, tExit, lookups)
-                            : integrateBrick(&floats_[first], lo, ray, tEnter, tExit, lookups);
+            integrateBrick<C>(&floats_[first], lo, ray, tEnter, tExit, lookups, part);
+        }
+        for (size_t c = 0; c < C; ++c) {
+            sum[c] += part[c];
         }
         return true;
     });
     return sum;
 }
+
+template std::array<double, 1> ExtinctionField::integrate<1>(const LocalRay&, double, double,
+                                                             uint64_t&, uint64_t&) const;
+template std::array<double, 3> ExtinctionField::integrate<3>(const LocalRay&, double, double,
+                                                             uint64_t&, uint64_t&) const;
 
 }  // namespace trk

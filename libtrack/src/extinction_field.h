@@ -5,6 +5,8 @@
 
 #include "sparse_table.h"
 
+#include <algorithm>
+#include <array>
 #include <cstddef>
 #include <cstdint>
 #include <cstring>
@@ -48,11 +50,13 @@ inline uint16_t encodeHalf(float value) {
     return static_cast<uint16_t>((bits - (112u << 23)) >> 13);
 }
 
-/// Trilinear density over local space: voxel centres at integer coordinates, 0 outside. Immutable.
+/// Trilinear density over local space: voxel centres at integer coordinates, 0 outside, of one
+/// channel or three. Immutable.
 ///
 /// A brick at b covers the cells b..b+7 per axis, hence the vertices b..b+8. Bricks whose vertices
 /// all agree are not stored: their entry is a constant, and so are larger regions. All values are
-/// finite and not negative. Storage is half where that is exact for every value.
+/// finite and not negative, the channels of a vertex side by side. Storage is half where that is
+/// exact for every value. Functions with a parameter C want the field's number of channels.
 class ExtinctionField {
   public:
     using Entry = SparseTable::Entry;
@@ -66,34 +70,47 @@ class ExtinctionField {
     ExtinctionField() = default;
 
     /// Bricks lie one after another in `floats` or `halfs`, x slowest; the other one is empty.
-    ExtinctionField(SparseTable table, std::vector<float> constants, std::vector<float> floats,
-                    std::vector<uint16_t> halfs);
+    /// `constants`: `channels` values each.
+    ExtinctionField(size_t channels, SparseTable table, std::vector<float> constants,
+                    std::vector<float> floats, std::vector<uint16_t> halfs);
+
+    size_t channels() const { return channels_; }
 
     /// Box of the occupied bricks and tiles, in cells; nothing but 0 lies outside.
     const IntBox& box() const { return box_; }
     bool isHalf() const { return !halfs_.empty(); }
     size_t bytes() const;
-    size_t brickCount() const { return (floats_.size() + halfs_.size()) / kBrickVertices; }
+    size_t brickCount() const {
+        return (floats_.size() + halfs_.size()) / (kBrickVertices * channels_);
+    }
     const SparseTable& table() const { return table_; }
 
-    /// Value of an entry that is empty or has the constant flag.
-    float constant(Entry entry) const {
-        return entry == SparseTable::kEmpty ? 0.0f : constants_[entry & ~kConstantFlag];
+    /// Values of an entry that is empty or has the constant flag, one a channel.
+    const float* constant(Entry entry) const {
+        static constexpr float kNothing[3] = {0, 0, 0};
+        return entry == SparseTable::kEmpty ? kNothing
+                                            : &constants_[(entry & ~kConstantFlag) * channels_];
     }
     static bool isConstant(Entry entry) {
         return entry == SparseTable::kEmpty || (entry & kConstantFlag) != 0;
     }
-    /// Copies the vertices of brick `entry` to `out`.
-    void copyBrick(Entry entry, float (&out)[kBrickVertices]) const;
+    /// One channel of vertex `i` of brick `entry`.
+    float vertex(Entry entry, size_t i, size_t channel) const {
+        const size_t at = ((entry - 1) * kBrickVertices + i) * channels_ + channel;
+        return isHalf() ? decodeHalf(halfs_[at]) : floats_[at];
+    }
 
     /// Density at a point of local space (its coordinates not negative).
-    float density(const Vec3d& point) const {
+    template <size_t C>
+    std::array<float, C> density(const Vec3d& point) const {
         const auto x = static_cast<int64_t>(point[0]);
         const auto y = static_cast<int64_t>(point[1]);
         const auto z = static_cast<int64_t>(point[2]);
         const Entry entry = table_.find(x, y, z).entry;
+        std::array<float, C> result;
         if (isConstant(entry)) {
-            return constant(entry);
+            std::copy_n(constant(entry), C, result.begin());
+            return result;
         }
         const size_t vertex =
             (entry - 1) * kBrickVertices +
@@ -102,31 +119,37 @@ class ExtinctionField {
         const auto fx = static_cast<float>(point[0] - static_cast<double>(x));
         const auto fy = static_cast<float>(point[1] - static_cast<double>(y));
         const auto fz = static_cast<float>(point[2] - static_cast<double>(z));
-        return isHalf() ? interpolate<float>(Corners<float>(&halfs_[vertex]), fx, fy, fz)
-                        : interpolate<float>(Corners<float>(&floats_[vertex]), fx, fy, fz);
+        for (size_t c = 0; c < C; ++c) {
+            const size_t at = vertex * C + c;
+            result[c] = isHalf() ? interpolate<float>(Corners<float, C>(&halfs_[at]), fx, fy, fz)
+                                 : interpolate<float>(Corners<float, C>(&floats_[at]), fx, fy, fz);
+        }
+        return result;
     }
 
     /// Integral of the density over [t0, t1] of the ray, in voxel lengths, by the closed form of
     /// each cell: along a line a trilinear field is a cubic there, for which two Gauss points are
     /// exact. Adds two look-ups a cell to `lookups` and the bricks and tiles met to `regions`.
-    double integrate(const LocalRay& ray, double t0, double t1, uint64_t& lookups,
-                     uint64_t& regions) const;
+    template <size_t C>
+    std::array<double, C> integrate(const LocalRay& ray, double t0, double t1, uint64_t& lookups,
+                                    uint64_t& regions) const;
 
   private:
-    template <class Real>
+    /// One channel at the corners of a cell, of C that lie side by side.
+    template <class Real, size_t C>
     struct Corners {
         Real v[8];
 
         template <class Stored>
         explicit Corners(const Stored* p)
-            : v{load(p[0]),  load(p[1]),  load(p[9]),  load(p[10]),
-                load(p[81]), load(p[82]), load(p[90]), load(p[91])} {}
+            : v{load(p[0]),      load(p[C]),      load(p[9 * C]),  load(p[10 * C]),
+                load(p[81 * C]), load(p[82 * C]), load(p[90 * C]), load(p[91 * C])} {}
         static Real load(float value) { return value; }
         static Real load(uint16_t half) { return decodeHalf(half); }
     };
 
-    template <class Real>
-    static Real interpolate(const Corners<Real>& c, Real fx, Real fy, Real fz) {
+    template <class Real, size_t C>
+    static Real interpolate(const Corners<Real, C>& c, Real fx, Real fy, Real fz) {
         const Real v00 = c.v[0] + fz * (c.v[1] - c.v[0]);
         const Real v01 = c.v[2] + fz * (c.v[3] - c.v[2]);
         const Real v10 = c.v[4] + fz * (c.v[5] - c.v[4]);
@@ -136,10 +159,11 @@ class ExtinctionField {
         return v0 + fx * (v1 - v0);
     }
 
-    template <class Stored>
-    static double integrateBrick(const Stored* brick, const Int3& lo, const LocalRay& ray,
-                                 double t0, double t1, uint64_t& lookups);
+    template <size_t C, class Stored>
+    static void integrateBrick(const Stored* brick, const Int3& lo, const LocalRay& ray, double t0,
+                               double t1, uint64_t& lookups, std::array<double, C>& sum);
 
+    size_t channels_ = 1;
     SparseTable table_;
     std::vector<float> constants_;
     std::vector<float> floats_;

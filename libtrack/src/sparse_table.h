@@ -38,6 +38,12 @@ class SparseTable {
 
     static constexpr Entry kEmpty = 0;
     static constexpr Entry kNodeFlag = 0x80000000u;
+    /// On an entry whose contents vary within an item and go by the item's place: 512 of them are a
+    /// node, not a tile.
+    static constexpr Entry kSingleFlag = 0x20000000u;
+
+    /// What the entry of an item says besides flags, counted from 0.
+    static size_t index(Entry entry) { return (entry & ~kSingleFlag) - 1; }
 
     struct Found {
         Entry entry;
@@ -132,7 +138,7 @@ class SparseTable {
     Entry addNode(const Node& node) {
         const bool same =
             std::all_of(node.begin(), node.end(), [&](Entry e) { return e == node[0]; });
-        if (same && (node[0] & kNodeFlag) == 0) {
+        if (same && (node[0] & (kNodeFlag | kSingleFlag)) == 0) {
             return node[0];
         }
         const uint64_t hash = hashWords(node.data(), node.size() / 2, 0);

@@ -1,9 +1,22 @@
 // SPDX-License-Identifier: Apache-2.0
 #include "super_voxels.h"
 
+#include <cmath>
+#include <limits>
 #include <utility>
 
 namespace trk {
+namespace {
+
+/// How far a control may exceed the extinction. [Novak14, Eq. 6]: about D S collisions are
+/// expected, each amplifies by at most 1 + (control - extinction) / S; the formula caps their
+/// product at gamma = 2.
+double allowedExcess(double range, double diagonal) {
+    return range * std::expm1(std::log(2.0) / (diagonal * range));
+}
+
+}  // namespace
+
 double SuperVoxels::chooseControl(TrkChoice choice, double min, double mean, double max,
                                   double diagonal) {
     switch (choice) {
@@ -16,64 +29,89 @@ double SuperVoxels::chooseControl(TrkChoice choice, double min, double mean, dou
         default:
             break;
     }
-    // [Novak14, Eq. 6]: about D S collisions are expected, each amplifies by at most
-    // 1 + (control - min) / S; the formula caps their product at gamma = 2.
     const double range = max - min;
     if (range <= 0) {
         return mean;
     }
-    const double control = min + range * std::expm1(std::log(2.0) / (diagonal * range));
-    return std::min(std::max(control, min), mean);
+    return std::min(std::max(min + allowedExcess(range, diagonal), min), mean);
 }
 
-SuperVoxels::SuperVoxels(BakedVolume baked, float scale, TrkChoice choice, double diagonal)
-    : table_(std::move(baked.table)), levels_(std::move(baked.levels)) {
+double SuperVoxels::chooseShare(TrkChoice choice, double min, double max, double excess,
+                                double diagonal) {
+    const double range = max - min;
+    if (choice == TRK_CHOICE_MEAN || range <= 0 || excess <= 0) {
+        return 1;
+    }
+    return std::min(1.0, allowedExcess(range, diagonal) / excess);
+}
+
+SuperVoxels::SuperVoxels(BakedVolume baked, const std::vector<double>& scales, TrkChoice choice,
+                         double diagonal)
+    : table_(std::move(baked.table)), kind_(baked.kind), levels_(std::move(baked.levels)) {
     const double superDiagonal = diagonal * baked.superVoxelSize();
-    items_.reserve(baked.items.size());
-    for (const BakedSuperVoxel& item : baked.items) {
-        const double s = scale;
+    const size_t channels = scales.size();
+    // A tinted volume has three channels of one item.
+    const auto itemOf = [&](size_t i) { return baked.channels == channels ? i : i / channels; };
+    const size_t count = baked.items.size() / baked.channels * channels;
+    items_.reserve(count);
+    shapes_.reserve(kind_ == ControlKind::kConstant ? 0 : count * (1 + slopeSize(kind_)));
+    for (size_t i = 0; i < count; ++i) {
+        const BakedSuperVoxel& item = baked.items[itemOf(i)];
+        const ControlPolynomial<double> control = baked.control(itemOf(i));
+        const double s = scales[i % channels];
         const double min = s * static_cast<double>(item.min);
         const double max = s * static_cast<double>(item.max);
-        const double mean = s * static_cast<double>(item.control);
+        const double majorant = s * static_cast<double>(item.majorant);
         SuperVoxel v;
-        v.mean = static_cast<float>(mean);
+        v.baked = static_cast<float>(s * control.centre);
         v.max = roundUp(max);
-        // A homogeneous super-voxel keeps its value to the bit, so that nothing is left to track.
-        v.control = static_cast<float>(chooseControl(choice, min, mean, max, superDiagonal));
-        const double control = v.control;
-        v.bound = item.min == item.max ? 0.0f : roundUp(std::max(control - min, max - control));
+        double share = 1;
+        if (item.min == item.max) {
+            // A homogeneous super-voxel keeps its value to the bit: nothing is left to track.
+            v.baked = v.control = v.max = static_cast<float>(min);
+            v.bound = 0;
+        } else if (kind_ == ControlKind::kConstant) {
+            v.control = static_cast<float>(
+                chooseControl(choice, min, s * static_cast<double>(item.mean), max, superDiagonal));
+            const auto chosen = static_cast<double>(v.control);
+            v.bound = roundUp(std::max(chosen - min, max - chosen));
+        } else {
+            const double excess = std::min(majorant, s * control.max() - min);
+            share = chooseShare(choice, min, max, excess, superDiagonal);
+            v.control = static_cast<float>(min + share * (s * control.centre - min));
+            v.bound = roundUp(share * majorant + (1 - share) * (max - min));
+        }
+        if (item.min != item.max && v.max == v.baked) {  // by chance; it says homogeneous
+            v.max = std::nextafter(v.max, std::numeric_limits<float>::infinity());
+        }
         items_.push_back(v);
-    }
-    for (ScalarTable& level : levels_) {
-        for (float& value : level.values) {
-            value *= scale;
+        if (kind_ != ControlKind::kConstant) {
+            shapes_.push_back(static_cast<float>(share));
+            for (size_t k = 0; k < slopeSize(kind_); ++k) {
+                shapes_.push_back(static_cast<float>(s * control.slope[k]));
+            }
         }
     }
+    for (ValueTable& level : levels_) {
+        std::vector<float> extinctions(level.values.size() / baked.channels * channels);
+        for (size_t i = 0; i < extinctions.size(); ++i) {
+            extinctions[i] =
+                static_cast<float>(scales[i % channels] * static_cast<double>(level.values[itemOf(i)]));
+        }
+        level.values = std::move(extinctions);
+    }
     boxes_.assign(1, table_.occupiedBox());
-    for (const ScalarTable& level : levels_) {
+    for (const ValueTable& level : levels_) {
         boxes_.push_back(level.table.occupiedBox());
     }
 }
 
 size_t SuperVoxels::bytes() const {
-    size_t sum = table_.bytes() + items_.capacity() * sizeof(SuperVoxel);
-    for (const ScalarTable& level : levels_) {
+    size_t sum = table_.bytes() + items_.capacity() * sizeof(SuperVoxel) +
+                 shapes_.capacity() * sizeof(float);
+    for (const ValueTable& level : levels_) {
         sum += level.table.bytes() + level.values.capacity() * sizeof(float);
     }
-    return sum;
-}
-
-double SuperVoxels::integrateControl(const LocalRay& ray, size_t level, uint64_t& regions) const {
-    double sum = 0;
-    const SparseTable& table = level == 0 ? table_ : levels_[level - 1].table;
-    table.walk(ray, 0, ray.tEnd,
-               [&](SparseTable::Entry entry, const Int3&, int, double tEnter, double tExit) {
-                   ++regions;
-                   const float mean =
-                       level == 0 ? items_[entry - 1].mean : levels_[level - 1].values[entry - 1];
-                   sum += static_cast<double>(mean) * (tExit - tEnter);
-                   return true;
-               });
     return sum;
 }
 

@@ -2,41 +2,54 @@
 // The baked grid: as it is stored (density units) and as a query reads it (extinction).
 #pragma once
 
+#include "control_shape.h"
 #include "sparse_table.h"
 #include "track/track.h"
 
 #include <algorithm>
+#include <array>
 #include <cstddef>
 #include <cstdint>
 #include <vector>
 
 namespace trk {
 
-/// Statistics of one super-voxel of size N over its (N+1)^3 vertices, in density units. The mean
-/// weighs a vertex by the share of it that lies inside (1, 1/2, 1/4, 1/8), which makes it the mean
-/// of the trilinear field. Bounds are rounded outward.
+/// Statistics of one channel of a super-voxel of size N over its (N+1)^3 vertices, in density
+/// units. The mean weighs a vertex by the share of it that lies inside (1, 1/2, 1/4, 1/8), which
+/// makes it the mean of the trilinear field. Bounds are rounded outward.
 struct BakedSuperVoxel {
     float min = 0;
     float max = 0;
-    float control = 0;   ///< the mean
-    float majorant = 0;  ///< sup |density - control|
-    float rms = 0;       ///< upper bound of the residual's root mean square
+    float mean = 0;
+    float deviation = 0;  ///< upper bound of the root mean square of density - mean
+    float majorant = 0;   ///< sup |density - control|
+    float rms = 0;        ///< upper bound of the residual's root mean square
 };
 
-/// One number per super-voxel.
-struct ScalarTable {
-    SparseTable table;  ///< entry: index into `values`, plus one
+/// `channels` numbers per super-voxel, those of a super-voxel side by side.
+struct ValueTable {
+    SparseTable table;  ///< entry: index of a super-voxel's values, plus one
     std::vector<float> values;
 };
 
-/// A whole bake. `table` maps local space to indices into `items`, plus one.
+/// A whole bake. `table` maps local space to indices of super-voxels; equal ones are one. Each has
+/// `channels` items and as many shapes, side by side. Where a control is not constant in its
+/// super-voxel, the table's entry has SparseTable::kSingleFlag.
 struct BakedVolume {
     int superVoxelShift = 4;  ///< log2 of the size
+    size_t channels = 1;
+    ControlKind kind = ControlKind::kConstant;
     SparseTable table;
     std::vector<BakedSuperVoxel> items;
-    std::vector<ScalarTable> levels;  ///< means of super-voxels 2, 4, … times as large
+    std::vector<float> shapes;       ///< shapeSize(kind) numbers a channel, see control_shape.h
+    std::vector<ValueTable> levels;  ///< means of super-voxels 2, 4, … times as large
 
     int superVoxelSize() const { return 1 << superVoxelShift; }
+    const float* shape(size_t item) const { return shapes.data() + item * shapeSize(kind); }
+    /// The control of an item (a super-voxel and channel).
+    ControlPolynomial<double> control(size_t item) const {
+        return controlPolynomial(kind, items[item].mean, shape(item), superVoxelSize());
+    }
     float maxDensity() const {
         float max = 0;
         for (const BakedSuperVoxel& item : items) {
@@ -46,22 +59,103 @@ struct BakedVolume {
     }
 };
 
-/// What a query needs of one super-voxel, in extinction (1/world unit).
+/// What a query needs of one channel of a super-voxel, in extinction (1/world unit).
 struct SuperVoxel {
-    float mean;     ///< the baked control
-    float control;  ///< of the residual method, as chosen
+    float baked;    ///< the baked control at the super-voxel's centre
+    float control;  ///< of the residual method, as chosen, there
     float bound;    ///< sup |extinction - control|
-    float max;
+    float max;      ///< equal to `baked` where the super-voxel is homogeneous
 };
 
-/// The super-voxels of an opened volume. Immutable.
+/// A super-voxel on a ray's way: C channels, a control of kind K.
+template <size_t C, ControlKind K>
+class SuperVoxelView {
+  public:
+    SuperVoxelView(const SuperVoxel* items, const float* shapes, const Int3& lo, double size)
+        : items_(items), shapes_(shapes), lo_(lo), inverseSize_(1 / size) {}
+
+    const SuperVoxel& operator[](size_t channel) const { return items_[channel]; }
+
+    /// The chosen control at a point of local space.
+    double control(size_t channel, const Vec3d& point) const {
+        const auto centre = static_cast<double>(items_[channel].control);
+        if constexpr (K == ControlKind::kConstant) {
+            return centre;
+        } else {
+            const float* shape = shapes_ + channel * kStride;
+            return centre + static_cast<double>(shape[0]) * slope(shape + 1, toUnit(point));
+        }
+    }
+    /// Integral of the chosen control over [t0, t1] of the ray, in voxel lengths.
+    double integrateControl(size_t channel, const LocalRay& ray, double t0, double t1) const {
+        const auto centre = static_cast<double>(items_[channel].control);
+        if constexpr (K == ControlKind::kConstant) {
+            return centre * (t1 - t0);
+        } else {
+            const float* shape = shapes_ + channel * kStride;
+            return centre * (t1 - t0) +
+                   static_cast<double>(shape[0]) * integrateSlope(shape + 1, ray, t0, t1);
+        }
+    }
+    /// The same of the baked control.
+    double integrateBaked(size_t channel, const LocalRay& ray, double t0, double t1) const {
+        const auto centre = static_cast<double>(items_[channel].baked);
+        if constexpr (K == ControlKind::kConstant) {
+            return centre * (t1 - t0);
+        } else {
+            return centre * (t1 - t0) +
+                   integrateSlope(shapes_ + channel * kStride + 1, ray, t0, t1);
+        }
+    }
+
+    /// Floats of a channel in the array of shapes: the share of the baked control's slope that the
+    /// chosen one keeps, then the coefficients of the slope in extinction.
+    static constexpr size_t kStride = slopeSize(K) == 0 ? 0 : 1 + slopeSize(K);
+
+  private:
+    Vec3d toUnit(const Vec3d& point) const {
+        Vec3d u;
+        for (int a = 0; a < 3; ++a) {
+            u[a] =
+                (point[a] - static_cast<double>(lo_[static_cast<size_t>(a)])) * inverseSize_ - 0.5;
+        }
+        return u;
+    }
+    static double slope(const float* coefficients, const Vec3d& u) {
+        return evaluateSlope<K>(coefficients, u);
+    }
+    /// An affine control is linear along a ray, a trilinear one cubic: one Gauss point is exact for
+    /// the first, two for the second.
+    double integrateSlope(const float* coefficients, const LocalRay& ray, double t0,
+                          double t1) const {
+        const double middle = 0.5 * (t0 + t1);
+        if constexpr (K == ControlKind::kAffine) {
+            return slope(coefficients, toUnit(ray.at(middle))) * (t1 - t0);
+        } else {
+            const double offset = 0.5 * (t1 - t0) * 0.57735026918962576451;  // 1/sqrt(3)
+            return 0.5 * (t1 - t0) *
+                   (slope(coefficients, toUnit(ray.at(middle - offset))) +
+                    slope(coefficients, toUnit(ray.at(middle + offset))));
+        }
+    }
+
+    const SuperVoxel* items_;
+    const float* shapes_;
+    const Int3& lo_;
+    double inverseSize_;
+};
+
+/// The super-voxels of an opened volume, of as many channels as its extinction has. Immutable.
 class SuperVoxels {
   public:
     SuperVoxels() = default;
 
-    /// `diagonal`: world length of a voxel's longest diagonal.
-    SuperVoxels(BakedVolume baked, float scale, TrkChoice choice, double diagonal);
+    /// `scales`: extinction of a density of 1, per channel; one or three, and as many as the bake
+    /// has channels unless that is one. `diagonal`: world length of a voxel's longest diagonal.
+    SuperVoxels(BakedVolume baked, const std::vector<double>& scales, TrkChoice choice,
+                double diagonal);
 
+    ControlKind kind() const { return kind_; }
     int size() const { return 1 << table_.itemShift(); }
     uint64_t count() const { return table_.occupiedItems(); }
     size_t levelCount() const { return levels_.size(); }
@@ -69,28 +163,69 @@ class SuperVoxels {
     const IntBox& box(size_t level = 0) const { return boxes_[level]; }
     size_t bytes() const;
 
-    /// Calls `visit(const SuperVoxel&, tEnter, tExit)` along the ray until it answers false.
-    template <class Visit>
+    /// Calls `visit(const SuperVoxelView&, tEnter, tExit)` along the ray until it answers false.
+    /// C: the volume's channels; K: its kind of control, or kConstant where only what a view says
+    /// without a point is asked.
+    template <size_t C, ControlKind K, class Visit>
     void walk(const LocalRay& ray, double t0, double t1, Visit&& visit) const {
+        const double superVoxelSize = size();
         table_.walk(ray, t0, t1,
-                    [&](SparseTable::Entry entry, const Int3&, int, double tEnter, double tExit) {
-                        return visit(items_[entry - 1], tEnter, tExit);
+                    [&](SparseTable::Entry entry, const Int3& lo, int, double tEnter,
+                        double tExit) {
+                        const size_t item = SparseTable::index(entry) * C;
+                        using View = SuperVoxelView<C, K>;
+                        return visit(View(&items_[item], shapes_.data() + item * View::kStride, lo,
+                                          superVoxelSize),
+                                     tEnter, tExit);
                     });
     }
 
-    /// Integral of the control extinction of a level over the ray, times the length of a voxel.
-    /// Level 0 is the baked grid.
-    double integrateControl(const LocalRay& ray, size_t level, uint64_t& regions) const;
+    /// Integral of the baked control extinction of a level over the ray, times the length of a
+    /// voxel. Level 0 is the baked grid.
+    template <size_t C, ControlKind K>
+    std::array<double, C> integrateControl(const LocalRay& ray, size_t level,
+                                           uint64_t& regions) const {
+        std::array<double, C> sum{};
+        if (level == 0) {
+            walk<C, K>(ray, 0, ray.tEnd, [&](const auto& v, double tEnter, double tExit) {
+                ++regions;
+                for (size_t c = 0; c < C; ++c) {
+                    sum[c] += v.integrateBaked(c, ray, tEnter, tExit);
+                }
+                return true;
+            });
+            return sum;
+        }
+        const ValueTable& means = levels_[level - 1];
+        means.table.walk(
+            ray, 0, ray.tEnd,
+            [&](SparseTable::Entry entry, const Int3&, int, double tEnter, double tExit) {
+                ++regions;
+                const float* mean = &means.values[SparseTable::index(entry) * C];
+                for (size_t c = 0; c < C; ++c) {
+                    sum[c] += static_cast<double>(mean[c]) * (tExit - tEnter);
+                }
+                return true;
+            });
+        return sum;
+    }
 
-    /// The control that `choice` makes of statistics given as true extinction. `diagonal`: world
-    /// length of the super-voxel's longest diagonal.
+    /// The constant control that `choice` makes of statistics given as true extinction. `diagonal`:
+    /// world length of the super-voxel's longest diagonal.
     static double chooseControl(TrkChoice choice, double min, double mean, double max,
                                 double diagonal);
 
+    /// The share a of a control that is not constant which `choice` (robust or mean) keeps: the
+    /// chosen control is min + a (control - min). `excess`: a bound of control - extinction.
+    static double chooseShare(TrkChoice choice, double min, double max, double excess,
+                              double diagonal);
+
   private:
     SparseTable table_;
+    ControlKind kind_ = ControlKind::kConstant;
     std::vector<SuperVoxel> items_;
-    std::vector<ScalarTable> levels_;      // in extinction
+    std::vector<float> shapes_;
+    std::vector<ValueTable> levels_;       // in extinction
     std::vector<IntBox> boxes_{IntBox{}};  // one a level, from 0
 };
 

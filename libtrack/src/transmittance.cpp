@@ -5,12 +5,14 @@
 #include "estimators/exact.h"
 #include "estimators/ratio_tracking.h"
 #include "rng.h"
+#include "variant.h"
 
 #include <tbb/blocked_range.h>
 #include <tbb/parallel_for.h>
 #include <tbb/task_arena.h>
 
 #include <algorithm>
+#include <array>
 #include <cmath>
 #include <limits>
 #include <string>
@@ -69,49 +71,65 @@ void checkMethod(const Volume& volume, const TrkQuery& query) {
 }
 
 /// Optical depth by a method without noise.
-double deterministicDepth(const Volume& volume, const TrkQuery& query, const TrkRay& ray,
-                          double& clippedLength, PathCost& cost) {
+template <class V>
+std::array<double, V::kChannels> deterministicDepth(const Volume& volume, const TrkQuery& query,
+                                                    const TrkRay& ray, double& clippedLength,
+                                                    PathCost& cost) {
     LocalRay local;
     double lengthPerVoxel = 0;
-    if (query.method == TRK_METHOD_EXACT) {
-        if (!volume.clip(ray, volume.field.box(), local, lengthPerVoxel)) {
-            return 0;
-        }
-        clippedLength = local.tEnd;
-        return exactOpticalDepth(volume.field, local,
-                                 static_cast<double>(volume.scale) * lengthPerVoxel, cost);
-    }
-    if (!volume.clip(ray, volume.superVoxels.box(query.level), local, lengthPerVoxel)) {
-        return 0;
+    const bool exact = query.method == TRK_METHOD_EXACT;
+    const IntBox& box = exact ? volume.field.box() : volume.superVoxels.box(query.level);
+    if (!volume.clip(ray, box, local, lengthPerVoxel)) {
+        return {};
     }
     clippedLength = local.tEnd;
-    return lengthPerVoxel *
-           volume.superVoxels.integrateControl(local, query.level, cost.superVoxels);
+    if (exact) {
+        return exactOpticalDepth(typename V::Extinction(volume), local, lengthPerVoxel, cost);
+    }
+    auto depth = V::integrateControl(volume.superVoxels, local, query.level, cost.superVoxels);
+    for (double& d : depth) {
+        d *= lengthPerVoxel;
+    }
+    return depth;
 }
 
-/// Mean and standard error of query.samples estimates of one ray.
-template <class Method>
-double trackSamples(const Volume& volume, const TrkQuery& query, const LocalRay& ray,
-                    double lengthPerVoxel, uint64_t rayId, PathCost& cost, double& standardError) {
+/// Mean and standard error of the estimates of one ray, per channel.
+template <size_t C>
+struct Estimate {
+    std::array<double, C> mean;
+    std::array<double, C> standardError;
+};
+
+/// Of query.samples estimates.
+template <class V, class Method>
+Estimate<V::kChannels> trackSamples(const Volume& volume, const TrkQuery& query,
+                                    const LocalRay& ray, double lengthPerVoxel, uint64_t rayId,
+                                    PathCost& cost) {
     TrackingSettings settings;
-    settings.scale = static_cast<double>(volume.scale);
     settings.lengthPerVoxel = lengthPerVoxel;
     settings.rate = static_cast<double>(query.rate);
     settings.exactFallback = (query.flags & TRK_QUERY_EXACT_FALLBACK) != 0;
-    double mean = 0;
-    double squares = 0;  // sum of squared deviations, updated without cancellation [Welford 1962]
+    const typename V::Extinction extinction(volume);
+    const typename V::Walk superVoxels{volume.superVoxels};
+    Estimate<V::kChannels> result{};
+    // Sums of squared deviations, updated without cancellation [Welford 1962].
+    std::array<double, V::kChannels> squares{};
     for (uint32_t i = 0; i < query.samples; ++i) {
         Rng rng(query.seed, query.stream, rayId, i);
-        const double estimate =
-            trackTransmittance<Method>(volume.field, volume.superVoxels, ray, settings, rng, cost);
-        const double delta = estimate - mean;
-        mean += delta / (i + 1.0);
-        squares += delta * (estimate - mean);
+        const auto estimate =
+            trackTransmittance<Method>(extinction, superVoxels, ray, settings, rng, cost);
+        for (size_t c = 0; c < V::kChannels; ++c) {
+            const double delta = estimate[c] - result.mean[c];
+            result.mean[c] += delta / (i + 1.0);
+            squares[c] += delta * (estimate[c] - result.mean[c]);
+        }
     }
     const double n = query.samples;
-    standardError = query.samples > 1 ? std::sqrt(squares / (n * (n - 1)))
-                                      : std::numeric_limits<double>::quiet_NaN();
-    return mean;
+    for (size_t c = 0; c < V::kChannels; ++c) {
+        result.standardError[c] = query.samples > 1 ? std::sqrt(squares[c] / (n * (n - 1)))
+                                                    : std::numeric_limits<double>::quiet_NaN();
+    }
+    return result;
 }
 
 float toFloat(double value) {
@@ -119,36 +137,44 @@ float toFloat(double value) {
     return static_cast<float>(std::fmin(std::fmax(value, -kLimit), kLimit));
 }
 
+template <class V>
 void estimateRay(const Volume& volume, const TrkQuery& query, const TrkRay& ray, uint64_t rayId,
-                 float& transmittance, TrkStatistics* statistics) {
+                 float* transmittance, TrkStatistics* statistics) {
+    constexpr size_t C = V::kChannels;
     PathCost cost;
     double clippedLength = 0;
-    double mean = 1;
-    double standardError = 0;
     double samples = 1;
+    Estimate<C> estimate;
+    estimate.mean.fill(1);
+    estimate.standardError.fill(0);
     if (query.method == TRK_METHOD_EXACT || query.method == TRK_METHOD_CONTROL) {
-        mean = std::exp(-deterministicDepth(volume, query, ray, clippedLength, cost));
+        const auto depth = deterministicDepth<V>(volume, query, ray, clippedLength, cost);
+        for (size_t c = 0; c < C; ++c) {
+            estimate.mean[c] = std::exp(-depth[c]);
+        }
     } else {
         LocalRay local;
         double lengthPerVoxel = 0;
         if (volume.clip(ray, volume.field.box(), local, lengthPerVoxel)) {
             clippedLength = local.tEnd;
             samples = query.samples;
-            mean = query.method == TRK_METHOD_RESIDUAL
-                       ? trackSamples<ResidualControl>(volume, query, local, lengthPerVoxel, rayId,
-                                                       cost, standardError)
-                       : trackSamples<NoControl>(volume, query, local, lengthPerVoxel, rayId, cost,
-                                                 standardError);
+            estimate =
+                query.method == TRK_METHOD_RESIDUAL
+                    ? trackSamples<V, ResidualControl>(volume, query, local, lengthPerVoxel, rayId,
+                                                       cost)
+                    : trackSamples<V, NoControl>(volume, query, local, lengthPerVoxel, rayId, cost);
         } else if (query.samples == 1) {
-            standardError = std::numeric_limits<double>::quiet_NaN();
+            estimate.standardError.fill(std::numeric_limits<double>::quiet_NaN());
         }
     }
-    transmittance = toFloat(mean);
+    std::transform(estimate.mean.begin(), estimate.mean.end(), transmittance, toFloat);
     if (statistics) {
         *statistics = TrkStatistics{};
         statistics->lookups = cost.lookups;
         statistics->superVoxels = cost.superVoxels;
-        statistics->standardError[0] = static_cast<float>(standardError);
+        for (size_t c = 0; c < C; ++c) {
+            statistics->standardError[c] = static_cast<float>(estimate.standardError[c]);
+        }
         statistics->exactShare =
             clippedLength > 0 ? static_cast<float>(cost.exactLength / (samples * clippedLength))
                               : 0.0f;
@@ -191,10 +217,15 @@ void estimateTransmittance(const Volume& volume, const TrkQuery& query, const Tr
                            size_t rayCount, float* transmittance, TrkStatistics* statistics) {
     checkMethod(volume, query);
     checkRays(query, rays, rayCount);
-    forEachRay(query, rayCount, [&](size_t i) {
-        const uint64_t id = query.rayIds ? query.rayIds[i] : query.firstRayId + i;
-        estimateRay(volume, query, rayAt(query, rays, i), id, transmittance[i],
-                    statistics ? statistics + i : nullptr);
+    const bool controlMatters =
+        query.method == TRK_METHOD_RESIDUAL || query.method == TRK_METHOD_CONTROL;
+    withVariant(volume, controlMatters, [&](auto variant) {
+        using V = decltype(variant);
+        forEachRay(query, rayCount, [&](size_t i) {
+            const uint64_t id = query.rayIds ? query.rayIds[i] : query.firstRayId + i;
+            estimateRay<V>(volume, query, rayAt(query, rays, i), id,
+                           transmittance + i * V::kChannels, statistics ? statistics + i : nullptr);
+        });
     });
 }
 
@@ -202,11 +233,15 @@ void integrateOpticalDepth(const Volume& volume, const TrkQuery& query, const Tr
                            size_t rayCount, double* opticalDepth) {
     checkMethod(volume, query);
     checkRays(query, rays, rayCount);
-    forEachRay(query, rayCount, [&](size_t i) {
-        PathCost cost;
-        double clippedLength = 0;
-        opticalDepth[i] =
-            deterministicDepth(volume, query, rayAt(query, rays, i), clippedLength, cost);
+    withVariant(volume, query.method == TRK_METHOD_CONTROL, [&](auto variant) {
+        using V = decltype(variant);
+        forEachRay(query, rayCount, [&](size_t i) {
+            PathCost cost;
+            double clippedLength = 0;
+            const auto depth =
+                deterministicDepth<V>(volume, query, rayAt(query, rays, i), clippedLength, cost);
+            std::copy(depth.begin(), depth.end(), opticalDepth + i * V::kChannels);
+        });
     });
 }
 

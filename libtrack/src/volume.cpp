@@ -5,6 +5,7 @@
 #include "io/density.h"
 #include "io/sidecar.h"
 
+#include <algorithm>
 #include <cmath>
 #include <filesystem>
 #include <limits>
@@ -18,12 +19,25 @@
 namespace trk {
 namespace {
 
-/// scale x density must stay within float, or every bound made of it is infinite.
-void checkScale(float scale, float maxDensity, const std::string& where) {
-    if (static_cast<double>(scale) * static_cast<double>(maxDensity) >
+/// Extinction of a density of 1 per channel; one channel where all agree.
+std::vector<double> channelScales(const VolumeOptions& options, size_t densityChannels) {
+    std::vector<double> scales;
+    for (const float color : options.color) {
+        scales.push_back(static_cast<double>(options.scale) * static_cast<double>(color));
+    }
+    if (densityChannels == 1 && scales[0] == scales[1] && scales[1] == scales[2]) {
+        scales.resize(1);
+    }
+    return scales;
+}
+
+/// scale x color x density must stay within float, or every bound made of it is infinite.
+void checkScale(const std::vector<double>& scales, float maxDensity, const std::string& where) {
+    const double scale = *std::max_element(scales.begin(), scales.end());
+    if (scale * static_cast<double>(maxDensity) >
         static_cast<double>(std::numeric_limits<float>::max())) {
         std::ostringstream line;
-        line << where << ": scale " << scale << " x density " << maxDensity
+        line << where << ": scale x color " << scale << " x density " << maxDensity
              << " is more than a float holds; expected at most "
              << std::numeric_limits<float>::max();
         throw Error(TRK_ERROR_INVALID_ARGUMENT, line.str());
@@ -101,7 +115,6 @@ std::string defaultSidecarPath(const std::string& vdbPath) {
 
 Volume openVolume(const char* vdbPath, const char* sidecarPath, const VolumeOptions& options) {
     Volume volume;
-    volume.scale = options.scale;
     const bool named = sidecarPath != nullptr && *sidecarPath != '\0';
     const bool wanted = sidecarPath == nullptr || named;
     if (named) {
@@ -124,6 +137,7 @@ Volume openVolume(const char* vdbPath, const char* sidecarPath, const VolumeOpti
         volume.grid = sidecar.header.source;
         volume.indexToWorld = sidecar.header.indexToWorld;
         volume.anchor = sidecar.anchor;
+        volume.scales = channelScales(options, sidecar.baked.channels);
     } else {
         DensityOptions densityOptions;
         densityOptions.gridNamed = options.gridNamed;
@@ -131,7 +145,8 @@ Volume openVolume(const char* vdbPath, const char* sidecarPath, const VolumeOpti
         densityOptions.repair = options.repair | (haveSidecar ? sidecar.header.repair : 0u);
         densityOptions.maxMemory = options.maxMemory;
         Density density = loadDensity(vdbPath, densityOptions);
-        checkScale(options.scale, density.summary.max, vdbPath);
+        volume.scales = channelScales(options, density.field.channels());
+        checkScale(volume.scales, density.summary.max, vdbPath);
         if (haveSidecar) {
             sidecar = readSidecar(volume.sidecarPath, &density.summary, options.check);
         }
@@ -144,8 +159,16 @@ Volume openVolume(const char* vdbPath, const char* sidecarPath, const VolumeOpti
     }
     volume.worldToIndex = volume.indexToWorld.inverse();
     if (haveSidecar) {
-        checkScale(options.scale, sidecar.baked.maxDensity(), volume.sidecarPath);
-        volume.superVoxels = SuperVoxels(std::move(sidecar.baked), options.scale, options.choice,
+        checkScale(volume.scales, sidecar.baked.maxDensity(), volume.sidecarPath);
+        const bool constantOnly =
+            options.choice == TRK_CHOICE_MIN || options.choice == TRK_CHOICE_MAX;
+        if (constantOnly && sidecar.baked.kind != ControlKind::kConstant) {
+            throw Error(TRK_ERROR_INVALID_ARGUMENT,
+                        volume.sidecarPath + ": choice min and max are constant controls, and this "
+                                             "sidecar's is " +
+                            controlName(sidecar.baked.kind) + "; expected robust or mean");
+        }
+        volume.superVoxels = SuperVoxels(std::move(sidecar.baked), volume.scales, options.choice,
                                          volume.indexToWorld.longestDiagonal());
         volume.hasSuperVoxels = true;
     }

@@ -126,8 +126,8 @@ void estimate(benchmark::State& state, TrkMethod method, int size, int depth, bo
 void bakeStatistics(benchmark::State& state) {
     const trk::Density density = fixtures::load(volumeFile());
     for (auto ignored : state) {
-        benchmark::DoNotOptimize(
-            vdbtools::bake(density.field, static_cast<int>(state.range(0)), 4));
+        benchmark::DoNotOptimize(vdbtools::bake(
+            density.field, fixtures::bakeOptions(static_cast<int>(state.range(0)), 4)));
     }
 }
 

@@ -383,7 +383,7 @@ case_real_volumes() {
     try pointgrid.vdb 1 "ptdataidx32"
     try sphere_points.vdb 1 "ptdataidx32"
     try box_background_one.vdb 1 "background is 1"
-    try sphere_cd.vdb 1 "vec3s"
+    try sphere_cd.vdb 1 "background is"
     try smoke_blosc.nvdb 1 "NanoVDB"
     expect 0 bake "$data/three_grids_same_name.vdb" --grid 'density[1]' -o one.track.vdb
     expect 0 verify "$data/three_grids_same_name.vdb" one.track.vdb --grid 'density[1]'

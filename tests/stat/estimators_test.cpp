@@ -10,6 +10,7 @@
 
 #include <gtest/gtest.h>
 
+#include <array>
 #include <cmath>
 #include <cstdint>
 #include <cstdio>
@@ -22,16 +23,26 @@ namespace {
 
 using namespace estimates;
 
-template <class SuperVoxels>
-double estimateOnce(const Scene& scene, const Variant& variant, const SuperVoxels& superVoxels,
-                    const PreparedRay& ray, trk::Rng& rng) {
-    trk::PathCost cost;
-    const trk::TrackingSettings settings = scene.settings(ray);
-    return variant.residual ? trk::trackTransmittance<trk::ResidualControl>(
-                                  scene.volume.field, superVoxels, ray.local, settings, rng, cost)
-                            : trk::trackTransmittance<trk::NoControl>(
-                                  scene.volume.field, superVoxels, ray.local, settings, rng, cost);
+/// One estimate of one channel.
+double estimateOnce(const Scene& scene, const PreparedRay& ray, trk::Rng& rng, size_t channel = 0) {
+    double result = 0;
+    trk::withVariant(scene.volume, scene.way.residual, [&](auto variant) {
+        using V = decltype(variant);
+        trk::PathCost cost;
+        const trk::TrackingSettings settings = scene.settings(ray);
+        const typename V::Extinction field(scene.volume);
+        const typename V::Walk superVoxels{scene.volume.superVoxels};
+        result = scene.way.residual
+                     ? trk::trackTransmittance<trk::ResidualControl>(field, superVoxels, ray.local,
+                                                                     settings, rng, cost)[channel]
+                     : trk::trackTransmittance<trk::NoControl>(field, superVoxels, ray.local,
+                                                               settings, rng, cost)[channel];
+    });
+    return result;
 }
+
+/// What the negative controls take apart: a grey volume with a constant control.
+using Grey = trk::Variant<1, 1, ControlKind::kConstant>;
 
 struct Source {
     std::string label;
@@ -47,47 +58,90 @@ std::vector<Source> sources() {
     return all;
 }
 
-std::string sidecarOf(const Source& source, int size) {
-    const std::string path = fixtures::path(source.label + std::to_string(size) + ".track.vdb");
-    fixtures::bake(source.vdb, path, size, 0);
+std::string sidecarOf(const Source& source, int size, ControlKind kind = ControlKind::kConstant) {
+    const std::string path =
+        fixtures::path(source.label + std::to_string(size) + trk::controlName(kind) + ".track.vdb");
+    fixtures::bake(source.vdb, path, size, 0, kind);
     return path;
 }
 
-TEST(Estimators, AreUnbiasedForEverySizeChoiceAndDepth) {
+/// Tests one channel of a scene and says what it found.
+void expectUnbiased(const Scene& scene, const std::string& label, size_t channel, uint64_t samples,
+                    double bound) {
+    const TestSet set = makeSet(scene, samples, channel);
+    const double z = zOf(set, 1 + channel, [&](const PreparedRay& ray, trk::Rng& rng) {
+        return estimateOnce(scene, ray, rng, channel);
+    });
+    std::printf("%-38s %-17s z %5.2f skewness %5.2f kurtosis %5.2f, %.1f %% of the length exact",
+                label.c_str(), scene.way.name.c_str(), z, set.skewness, set.excessKurtosis,
+                100 * set.exactShare);
+    if (set.testedShare < 1) {
+        std::printf(
+            ", too heavy a tail on whole rays (kurtosis %.0e): tested %.0f %% of their "
+            "length",
+            set.wholeKurtosis, 100 * set.testedShare);
+    }
+    std::printf("\n");
+    EXPECT_TRUE(set.isNormal()) << "too heavy a tail for this many samples";
+    EXPECT_LT(std::fabs(z), bound) << label << " " << scene.way.name;
+    EXPECT_LT(set.exactShare, 0.1);
+    EXPECT_GT(set.testedShare, 0.01);
+    if (scene.way.choice == TRK_CHOICE_ROBUST || scene.way.choice == TRK_CHOICE_MIN) {
+        EXPECT_EQ(set.testedShare, 1) << label << " " << scene.way.name;
+    }
+}
+
+TEST(Estimators, AreUnbiasedForEveryControlSizeAndDepth) {
     const std::vector<int> sizes{4, 8, 16, 32};
     const std::vector<double> depths{1, 10};
     const std::vector<Source> all = sources();
-    const double bound = sidakBound(all.size() * sizes.size() * depths.size() * kVariants.size());
+    const double bound = sidakBound(all.size() * sizes.size() * depths.size() * kWays.size());
     std::printf("|z| must stay below %.2f\n", bound);
     for (const Source& source : all) {
         for (const int size : sizes) {
-            const std::string sidecar = sidecarOf(source, size);
+            for (const Way& way : kWays) {
+                const std::string sidecar = sidecarOf(source, size, way.kind);
+                for (const double depth : depths) {
+                    const Scene scene(source.vdb, sidecar, way, depth, 300);
+                    char label[64];
+                    std::snprintf(label, sizeof(label), "%s, size %d, depth %g",
+                                  source.label.c_str(), size, depth);
+                    expectUnbiased(scene, label, 0, 150, bound);
+                }
+            }
+        }
+    }
+}
+
+TEST(Estimators, AreUnbiasedInColour) {
+    struct Colour {
+        Source source;
+        std::array<float, 3> color;
+    };
+    const std::vector<Colour> colours{
+        {{"tinted cloud", fixtures::cloudFile(96)}, {{1, 0.25f, 2}}},
+        {{"colour cloud", fixtures::cloudFile(96, "color-cloud")}, {{1, 1, 1}}},
+        {{"tinted colour cloud", fixtures::cloudFile(96, "color-cloud")}, {{1, 0.25f, 0}}}};
+    const std::vector<double> depths{1, 5};
+    // One channel of the last volume is 0, and no estimate.
+    const double bound = sidakBound((3 * colours.size() - 1) * depths.size() * kWays.size());
+    std::printf("|z| must stay below %.2f\n", bound);
+    for (const auto& [source, color] : colours) {
+        for (const Way& way : kWays) {
+            const std::string sidecar = sidecarOf(source, 8, way.kind);
             for (const double depth : depths) {
-                for (const Variant& variant : kVariants) {
-                    const Scene scene(source.vdb, sidecar, variant, depth, 300);
-                    const TestSet set = makeSet(scene, variant, 200);
-                    const double z = zOf(set, 1, [&](const PreparedRay& ray, trk::Rng& rng) {
-                        return estimateOnce(scene, variant, scene.volume.superVoxels, ray, rng);
-                    });
-                    std::printf(
-                        "%-16s size %2d depth %2g %-15s z %5.2f skewness %5.2f kurtosis "
-                        "%5.2f, %.1f %% of the length exact",
-                        source.label.c_str(), size, depth, variant.name.c_str(), z, set.skewness,
-                        set.excessKurtosis, 100 * set.exactShare);
-                    if (set.testedShare < 1) {
-                        std::printf(
-                            ", too heavy a tail on whole rays (kurtosis %.0e): tested %.0f "
-                            "%% of their length",
-                            set.wholeKurtosis, 100 * set.testedShare);
+                const Scene scene(source.vdb, sidecar, way, depth, 150, color);
+                ASSERT_EQ(scene.volume.channels(), 3u);
+                for (size_t channel = 0; channel < 3; ++channel) {
+                    if (color[channel] == 0) {
+                        trk::Rng rng(1, 2, 3, 4);
+                        EXPECT_EQ(estimateOnce(scene, scene.rays[0], rng, channel), 1.0);
+                        continue;
                     }
-                    std::printf("\n");
-                    EXPECT_TRUE(set.isNormal()) << "too heavy a tail for this many samples";
-                    EXPECT_LT(std::fabs(z), bound);
-                    EXPECT_LT(set.exactShare, 0.1);
-                    EXPECT_GT(set.testedShare, 0.01);
-                    if (variant.choice == TRK_CHOICE_ROBUST || variant.choice == TRK_CHOICE_MIN) {
-                        EXPECT_EQ(set.testedShare, 1);
-                    }
+                    char label[64];
+                    std::snprintf(label, sizeof(label), "%s, depth %g, channel %zu",
+                                  source.label.c_str(), depth, channel);
+                    expectUnbiased(scene, label, channel, 150, bound);
                 }
             }
         }
@@ -96,18 +150,17 @@ TEST(Estimators, AreUnbiasedForEverySizeChoiceAndDepth) {
 
 /// Runs a wrong estimator with as many samples as move its z by 10, and the right one beside it.
 template <class Wrong, class Factor>
-void expectRejected(const Scene& scene, const Variant& variant, const Wrong& wrong,
-                    const Factor& factor) {
-    TestSet set = makeSet(scene, variant, 50);
+void expectRejected(const Scene& scene, const Wrong& wrong, const Factor& factor) {
+    TestSet set = makeSet(scene, 50);
     while (std::fabs(shiftOf(set, factor)) < 10 && set.samples < 20000) {
-        set = makeSet(scene, variant, set.samples * 3 / 2);
+        set = makeSet(scene, set.samples * 3 / 2);
     }
     const double good = zOf(set, 3, [&](const PreparedRay& ray, trk::Rng& rng) {
-        return estimateOnce(scene, variant, scene.volume.superVoxels, ray, rng);
+        return estimateOnce(scene, ray, rng);
     });
     const double bad = zOf(set, 3, wrong);
     std::printf("%s: %llu samples a ray, z %.2f right, %.2f wrong (expected %.2f)\n",
-                variant.name.c_str(), static_cast<unsigned long long>(set.samples), good, bad,
+                scene.way.name.c_str(), static_cast<unsigned long long>(set.samples), good, bad,
                 shiftOf(set, factor));
     EXPECT_TRUE(set.isNormal());
     EXPECT_LT(std::fabs(good), 3.5);
@@ -118,23 +171,20 @@ TEST(Estimators, AControlDepthTwoPercentTooLargeIsRejected) {
     const Source source = sources().front();
     const std::string sidecar = sidecarOf(source, 8);
     for (const size_t v : {1u, 2u}) {  // `min` has next to no control that could be wrong
-        const Variant& variant = kVariants[v];
-        const Scene scene(source.vdb, sidecar, variant, 1, 300);
+        const Scene scene(source.vdb, sidecar, kWays[v], 1, 300);
         const auto factor = [&](const PreparedRay& ray) {
             double depth = 0;
-            scene.volume.superVoxels.walk(ray.local, 0, ray.local.tEnd,
-                                          [&](const trk::SuperVoxel& item, double t0, double t1) {
-                                              depth += static_cast<double>(item.control) *
-                                                       ray.lengthPerVoxel * (t1 - t0);
-                                              return true;
-                                          });
+            Grey::Walk{scene.volume.superVoxels}.walk(
+                ray.local, 0, ray.local.tEnd, [&](const auto& v2, double t0, double t1) {
+                    depth += ray.lengthPerVoxel * v2.integrateControl(0, ray.local, t0, t1);
+                    return true;
+                });
             return std::exp(-0.02 * depth);
         };
         expectRejected(
-            scene, variant,
+            scene,
             [&](const PreparedRay& ray, trk::Rng& rng) {
-                return factor(ray) *
-                       estimateOnce(scene, variant, scene.volume.superVoxels, ray, rng);
+                return factor(ray) * estimateOnce(scene, ray, rng);
             },
             factor);
     }
@@ -146,14 +196,17 @@ struct LyingSuperVoxels {
 
     static bool lies(const trk::SuperVoxel& v) {
         uint32_t bits;
-        std::memcpy(&bits, &v.mean, sizeof(bits));
+        std::memcpy(&bits, &v.baked, sizeof(bits));
         return v.bound > 0 && (bits >> 3 & 7) == 0;
     }
     template <class Visit>
     void walk(const LocalRay& ray, double t0, double t1, Visit&& visit) const {
-        truth.walk(ray, t0, t1, [&](trk::SuperVoxel v, double tEnter, double tExit) {
-            v.bound = lies(v) ? 0 : v.bound;
-            return visit(v, tEnter, tExit);
+        Grey::Walk{truth}.walk(ray, t0, t1, [&](const auto& v, double tEnter, double tExit) {
+            trk::SuperVoxel item = v[0];
+            item.bound = lies(item) ? 0 : item.bound;
+            const trk::Int3 anywhere{{0, 0, 0}};  // a constant control is the same everywhere
+            const trk::SuperVoxelView<1, ControlKind::kConstant> view(&item, nullptr, anywhere, 1);
+            return visit(view, tEnter, tExit);
         });
     }
 };
@@ -161,25 +214,26 @@ struct LyingSuperVoxels {
 TEST(Estimators, ABoundOfZeroWhereThereIsResidualIsRejected) {
     const Source source = sources().front();
     const std::string sidecar = sidecarOf(source, 8);
-    const Variant& variant = kVariants[3];  // over many rays, residuals of a mean control cancel
-    const Scene scene(source.vdb, sidecar, variant, 1, 300);
+    // Over many rays, residuals of a mean control cancel.
+    const Scene scene(source.vdb, sidecar, kWays[3], 1, 300);
     const LyingSuperVoxels lying{scene.volume.superVoxels};
+    const Grey::Extinction field(scene.volume);
     expectRejected(
-        scene, variant,
+        scene,
         [&](const PreparedRay& ray, trk::Rng& rng) {
-            return estimateOnce(scene, variant, lying, ray, rng);
+            trk::PathCost cost;
+            return trk::trackTransmittance<trk::ResidualControl>(field, lying, ray.local,
+                                                                 scene.settings(ray), rng, cost)[0];
         },
         [&](const PreparedRay& ray) {
             double untracked = 0;  // residual optical depth that nobody samples
-            scene.volume.superVoxels.walk(
-                ray.local, 0, ray.local.tEnd, [&](const trk::SuperVoxel& v, double t0, double t1) {
+            Grey::Walk{scene.volume.superVoxels}.walk(
+                ray.local, 0, ray.local.tEnd, [&](const auto& v, double t0, double t1) {
                     uint64_t ignored = 0;
-                    if (LyingSuperVoxels::lies(v)) {
-                        untracked +=
-                            ray.lengthPerVoxel *
-                            (static_cast<double>(scene.volume.scale) *
-                                 scene.volume.field.integrate(ray.local, t0, t1, ignored, ignored) -
-                             static_cast<double>(v.control) * (t1 - t0));
+                    if (LyingSuperVoxels::lies(v[0])) {
+                        untracked += ray.lengthPerVoxel *
+                                     (field.integrate(ray.local, t0, t1, ignored, ignored)[0] -
+                                      v.integrateControl(0, ray.local, t0, t1));
                     }
                     return true;
                 });
@@ -198,11 +252,11 @@ TEST(Estimators, RobustResidualBeatsRatioInVarianceTimesLookups) {
             const std::string sidecar = sidecarOf(source, size);
             double score[2];
             for (const size_t v : {0u, 1u}) {
-                const Scene scene(source.vdb, sidecar, kVariants[v], depth, 300);
+                const Scene scene(source.vdb, sidecar, kWays[v], depth, 300);
                 double variance = 0;
                 double lookups = 0;
                 for (const PreparedRay& ray : scene.rays) {
-                    const Moments m = momentsOf(scene, kVariants[v], ray);
+                    const Moments m = momentsOf(scene, ray);
                     variance += m.variance / static_cast<double>(scene.rays.size());
                     lookups += m.lookups / static_cast<double>(scene.rays.size());
                 }
@@ -210,7 +264,7 @@ TEST(Estimators, RobustResidualBeatsRatioInVarianceTimesLookups) {
                 std::printf(
                     "%s size %d depth %g %s: variance %.3g, %.3g look-ups, (0.01 + variance) x "
                     "look-ups %.3g\n",
-                    source.label.c_str(), size, depth, kVariants[v].name.c_str(), variance, lookups,
+                    source.label.c_str(), size, depth, kWays[v].name.c_str(), variance, lookups,
                     score[v]);
             }
             std::printf("residual over ratio: %.3f\n", score[1] / score[0]);

@@ -2,15 +2,18 @@
 // Sets of rays whose estimates are fit for a z-test: exact moments, tails, standard errors.
 #pragma once
 
+#include "estimators/exact.h"
 #include "estimators/ratio_tracking.h"
 #include "rng.h"
 #include "support/rays.h"
 #include "support/reference.h"
+#include "variant.h"
 #include "volume.h"
 
 #include <gtest/gtest.h>
 
 #include <algorithm>
+#include <array>
 #include <cmath>
 #include <cstdint>
 #include <random>
@@ -21,17 +24,25 @@ namespace estimates {
 
 using trk::LocalRay;
 
+using trk::ControlKind;
+
 /// One way of estimating: a method and, for residual, its control.
-struct Variant {
+struct Way {
     std::string name;
     bool residual;
     TrkChoice choice;
+    ControlKind kind;
 };
-inline const std::vector<Variant> kVariants{{"ratio", false, TRK_CHOICE_ROBUST},
-                                            {"residual robust", true, TRK_CHOICE_ROBUST},
-                                            {"residual mean", true, TRK_CHOICE_MEAN},
-                                            {"residual min", true, TRK_CHOICE_MIN},
-                                            {"residual max", true, TRK_CHOICE_MAX}};
+inline const std::vector<Way> kWays{
+    {"ratio", false, TRK_CHOICE_ROBUST, ControlKind::kConstant},
+    {"robust", true, TRK_CHOICE_ROBUST, ControlKind::kConstant},
+    {"mean", true, TRK_CHOICE_MEAN, ControlKind::kConstant},
+    {"min", true, TRK_CHOICE_MIN, ControlKind::kConstant},
+    {"max", true, TRK_CHOICE_MAX, ControlKind::kConstant},
+    {"affine robust", true, TRK_CHOICE_ROBUST, ControlKind::kAffine},
+    {"affine mean", true, TRK_CHOICE_MEAN, ControlKind::kAffine},
+    {"trilinear robust", true, TRK_CHOICE_ROBUST, ControlKind::kTrilinear},
+    {"trilinear mean", true, TRK_CHOICE_MEAN, ControlKind::kTrilinear}};
 
 /// z beyond which one of `comparisons` true hypotheses falls with probability 0.01 [Sidak 1967].
 inline double sidakBound(size_t comparisons) {
@@ -48,23 +59,27 @@ inline double sidakBound(size_t comparisons) {
 struct PreparedRay {
     LocalRay local;
     double lengthPerVoxel;
-    double exactDepth;  ///< true optical depth
+    std::array<double, 3> exactDepth;  ///< true optical depth, per channel
 };
 
-/// An opened volume at a scale where the rays that hit have a given mean optical depth.
+/// An opened volume at a scale where the rays that hit have a given mean optical depth in the first
+/// channel.
 struct Scene {
     trk::Volume volume;
+    Way way;
     std::vector<PreparedRay> rays;
 
-    Scene(const std::string& vdb, const std::string& sidecar, const Variant& variant,
-          double meanDepth, size_t count) {
+    Scene(const std::string& vdb, const std::string& sidecar, const Way& chosen, double meanDepth,
+          size_t count, const std::array<float, 3>& color = {{1, 1, 1}})
+        : way(chosen) {
         trk::VolumeOptions options;
-        options.choice = variant.choice;
+        options.choice = way.choice;
+        options.color = color;
         const trk::Volume unscaled = trk::openVolume(vdb.c_str(), "", options);
         rays = prepare(unscaled, count);
         double sum = 0;
         for (const PreparedRay& ray : rays) {
-            sum += ray.exactDepth;
+            sum += ray.exactDepth[0];
         }
         options.scale = static_cast<float>(meanDepth * static_cast<double>(rays.size()) / sum);
         volume = trk::openVolume(vdb.c_str(), sidecar.c_str(), options);
@@ -104,20 +119,29 @@ struct Scene {
             if (!volume.clip(ray, volume.field.box(), prepared.local, prepared.lengthPerVoxel)) {
                 continue;
             }
-            uint64_t ignored = 0;
-            prepared.exactDepth =
-                static_cast<double>(volume.scale) * prepared.lengthPerVoxel *
-                volume.field.integrate(prepared.local, 0, prepared.local.tEnd, ignored, ignored);
-            if (prepared.exactDepth > 0) {
+            prepared.exactDepth = exactDepthOf(volume, prepared);
+            if (prepared.exactDepth[0] > 0) {
                 result.push_back(prepared);
             }
         }
         return result;
     }
 
+    /// From the cells, not from the moments it is compared through.
+    static std::array<double, 3> exactDepthOf(const trk::Volume& volume, const PreparedRay& ray) {
+        std::array<double, 3> result{};
+        trk::withVariant(volume, true, [&](auto variant) {
+            using V = decltype(variant);
+            trk::PathCost cost;
+            const auto depth = trk::exactOpticalDepth(typename V::Extinction(volume), ray.local,
+                                                      ray.lengthPerVoxel, cost);
+            std::copy(depth.begin(), depth.end(), result.begin());
+        });
+        return result;
+    }
+
     trk::TrackingSettings settings(const PreparedRay& ray) const {
         trk::TrackingSettings s;
-        s.scale = static_cast<double>(volume.scale);
         s.lengthPerVoxel = ray.lengthPerVoxel;
         return s;
     }
@@ -135,48 +159,49 @@ struct Moments {
     double length = 0;
 };
 
-template <class Method>
-Moments momentsOf(const Scene& scene, const PreparedRay& ray) {
+template <class V, class Method>
+Moments momentsOf(const Scene& scene, const PreparedRay& ray, size_t channel) {
     const trk::TrackingSettings settings = scene.settings(ray);
+    const typename V::Extinction field(scene.volume);
+    const typename V::Walk superVoxels{scene.volume.superVoxels};
     const LocalRay& r = ray.local;
+    const double unit = settings.lengthPerVoxel;
     const double cellsPerVoxel =
         std::fabs(r.direction[0]) + std::fabs(r.direction[1]) + std::fabs(r.direction[2]);
     double logMoment[5] = {0, 0, 0, 0, 0};
     Moments m;
     m.length = r.tEnd;
-    scene.volume.superVoxels.walk(
-        r, 0, r.tEnd, [&](const trk::SuperVoxel& v, double t0, double t1) {
-            const double control = Method::control(v);
-            const double rate = Method::bound(v);
-            const double unit = settings.lengthPerVoxel;
-            const double expected = rate * unit * (t1 - t0);
-            const auto extinction = [&](double t) {
-                return settings.scale * static_cast<double>(scene.volume.field.density(r.at(t)));
-            };
-            if (rate == 0 || expected > 2 * (1 + cellsPerVoxel * (t1 - t0))) {
-                const double depth = rate == 0
-                                         ? control * unit * (t1 - t0)
-                                         : unit * reference::integrateCells(r.origin, r.direction,
-                                                                            t0, t1, extinction);
-                for (int p = 1; p <= 4; ++p) {
-                    logMoment[p] -= p * depth;
-                }
-                if (rate > 0) {
-                    m.exactLength += t1 - t0;
-                    m.lookups += 2 * cellsPerVoxel * (t1 - t0);
-                }
-                return true;
-            }
-            m.lookups += expected;
+    superVoxels.walk(r, 0, r.tEnd, [&](const auto& v, double t0, double t1) {
+        double rate = 0;
+        for (size_t c = 0; c < V::kChannels; ++c) {
+            rate = std::max(rate, Method::bound(v, c));
+        }
+        const bool hasResidual = Method::bound(v, channel) > 0;
+        const double expected = rate * unit * (t1 - t0);
+        const bool exact = expected > 2 * (1 + cellsPerVoxel * (t1 - t0));
+        const auto extinction = [&](double t) { return field.extinction(r.at(t))[channel]; };
+        if (exact || !hasResidual) {
+            const double depth =
+                exact ? reference::integrateCells(r.origin, r.direction, t0, t1, extinction)
+                      : Method::integrate(v, channel, r, t0, t1);
             for (int p = 1; p <= 4; ++p) {
-                logMoment[p] +=
-                    unit * reference::integrateCells(r.origin, r.direction, t0, t1, [&](double t) {
-                        const double w = 1 - (extinction(t) - control) / rate;
-                        return rate * (std::pow(w, p) - 1) - p * control;
-                    });
+                logMoment[p] -= p * unit * depth;
             }
+            m.exactLength += exact ? t1 - t0 : 0;
+            m.lookups += exact ? 2 * cellsPerVoxel * (t1 - t0) : expected;
             return true;
-        });
+        }
+        m.lookups += expected;
+        for (int p = 1; p <= 4; ++p) {
+            logMoment[p] +=
+                unit * reference::integrateCells(r.origin, r.direction, t0, t1, [&](double t) {
+                    const double control = Method::control(v, channel, r.at(t));
+                    const double w = 1 - (extinction(t) - control) / rate;
+                    return rate * (std::pow(w, p) - 1) - p * control;
+                });
+        }
+        return true;
+    });
     const double T = std::exp(logMoment[1]);
     const double m2 = std::exp(logMoment[2]);
     const double m3 = std::exp(logMoment[3]);
@@ -188,9 +213,14 @@ Moments momentsOf(const Scene& scene, const PreparedRay& ray) {
     return m;
 }
 
-inline Moments momentsOf(const Scene& scene, const Variant& variant, const PreparedRay& ray) {
-    return variant.residual ? momentsOf<trk::ResidualControl>(scene, ray)
-                            : momentsOf<trk::NoControl>(scene, ray);
+inline Moments momentsOf(const Scene& scene, const PreparedRay& ray, size_t channel = 0) {
+    Moments m;
+    trk::withVariant(scene.volume, scene.way.residual, [&](auto variant) {
+        using V = decltype(variant);
+        m = scene.way.residual ? momentsOf<V, trk::ResidualControl>(scene, ray, channel)
+                               : momentsOf<V, trk::NoControl>(scene, ray, channel);
+    });
+    return m;
 }
 
 /// One ray of a set, with its estimate's moments and its weight in the set's sum.
@@ -215,12 +245,9 @@ struct TestSet {
 
     bool isNormal() const { return excessKurtosis < 0.5 && std::fabs(skewness) < 0.35; }
 
-    void add(const Scene& scene, const PreparedRay& ray, const Moments& m, double weight) {
-        // The transmittance comes from the cells, not from the moments it is compared through.
-        uint64_t ignored = 0;
-        const double depth =
-            static_cast<double>(scene.volume.scale) * ray.lengthPerVoxel *
-            scene.volume.field.integrate(ray.local, 0, ray.local.tEnd, ignored, ignored);
+    void add(const Scene& scene, const PreparedRay& ray, const Moments& m, size_t channel,
+             double weight) {
+        const double depth = Scene::exactDepthOf(scene.volume, ray)[channel];
         EXPECT_NEAR(m.transmittance, std::exp(-depth), 1e-6);
         rays.push_back({ray, m, std::exp(-depth), weight});
     }
@@ -245,16 +272,16 @@ struct TestSet {
 /// that no number of samples tames on whole rays (at depth 10 the exact kurtosis of
 /// `max` is astronomical, see what the test prints): there the same code, at the same scale, is
 /// tested on as much of each ray as can be, rays weighing alike.
-inline TestSet makeSet(const Scene& scene, const Variant& variant, uint64_t samples) {
+inline TestSet makeSet(const Scene& scene, uint64_t samples, size_t channel = 0) {
     TestSet whole;
     whole.samples = samples;
     double exactLength = 0;
     double length = 0;
     for (const PreparedRay& ray : scene.rays) {
-        const Moments m = momentsOf(scene, variant, ray);
+        const Moments m = momentsOf(scene, ray, channel);
         exactLength += m.exactLength;
         length += m.length;
-        whole.add(scene, ray, m, 1);
+        whole.add(scene, ray, m, channel, 1);
     }
     whole.exactShare = exactLength / length;
     whole.summarize();
@@ -268,14 +295,14 @@ inline TestSet makeSet(const Scene& scene, const Variant& variant, uint64_t samp
     cut.wholeKurtosis = whole.excessKurtosis;
     double tested = 0;
     for (PreparedRay ray : scene.rays) {
-        for (Moments m = momentsOf(scene, variant, ray);; m = momentsOf(scene, variant, ray)) {
+        for (Moments m = momentsOf(scene, ray, channel);; m = momentsOf(scene, ray, channel)) {
             // Below, moments are the rounding error of a difference: nothing random is left.
             if (m.variance < 1e-7 * m.transmittance * m.transmittance) {
                 break;
             }
             if (m.fourth < kTail * static_cast<double>(samples) * m.variance * m.variance) {
                 tested += m.length;
-                cut.add(scene, ray, m, 1 / std::sqrt(m.variance));
+                cut.add(scene, ray, m, channel, 1 / std::sqrt(m.variance));
                 break;
             }
             ray.local.tEnd *= 0.8;

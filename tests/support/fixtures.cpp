@@ -27,6 +27,22 @@ struct TemporaryFolder {
     }
 };
 
+template <class GridType, class F>
+typename GridType::Ptr makeTypedGrid(const openvdb::CoordBBox& box, const F& f) {
+    openvdb::initialize();
+    auto grid = GridType::create();
+    auto accessor = grid->getAccessor();
+    for (auto at = box.begin(); at; ++at) {
+        const auto v = f(*at);
+        if (v != openvdb::zeroVal<typename GridType::ValueType>()) {
+            accessor.setValue(*at, v);
+        }
+    }
+    grid->setName("density");
+    grid->setGridClass(openvdb::GRID_FOG_VOLUME);
+    return grid;
+}
+
 }  // namespace
 
 std::string path(const std::string& name) {
@@ -41,18 +57,12 @@ std::string dataFolder() {
 
 openvdb::FloatGrid::Ptr makeGrid(const openvdb::CoordBBox& box,
                                  const std::function<float(const openvdb::Coord&)>& f) {
-    openvdb::initialize();
-    auto grid = openvdb::FloatGrid::create();
-    auto accessor = grid->getAccessor();
-    for (auto at = box.begin(); at; ++at) {
-        const float v = f(*at);
-        if (v != 0) {
-            accessor.setValue(*at, v);
-        }
-    }
-    grid->setName("density");
-    grid->setGridClass(openvdb::GRID_FOG_VOLUME);
-    return grid;
+    return makeTypedGrid<openvdb::FloatGrid>(box, f);
+}
+
+openvdb::Vec3SGrid::Ptr makeColorGrid(
+    const openvdb::CoordBBox& box, const std::function<openvdb::Vec3f(const openvdb::Coord&)>& f) {
+    return makeTypedGrid<openvdb::Vec3SGrid>(box, f);
 }
 
 openvdb::FloatGrid::Ptr makeBlob(int n) {
@@ -75,11 +85,12 @@ std::string write(const std::string& name, const openvdb::GridCPtrVec& grids) {
     return path(name);
 }
 
-std::string cloudFile(int n) {
-    const std::string name = path("cloud" + std::to_string(n) + ".vdb");
+std::string cloudFile(int n, const std::string& kind) {
+    const std::string name = path(kind + std::to_string(n) + ".vdb");
     if (!std::filesystem::exists(name)) {
         vdbtools::ProceduralOptions options;
         options.voxels = n;
+        options.kind = kind;
         trk::OutputFile file(name, false);
         vdbtools::writeProcedural(options, file, [](double) {});
         file.commit();
@@ -94,7 +105,16 @@ trk::Density load(const std::string& file, const std::string& grid) {
     return trk::loadDensity(file, options);
 }
 
-void bake(const std::string& vdb, const std::string& sidecar, int size, int levels) {
+vdbtools::BakeOptions bakeOptions(int size, int levels, trk::ControlKind kind) {
+    vdbtools::BakeOptions options;
+    options.superVoxelSize = size;
+    options.levels = levels;
+    options.kind = kind;
+    return options;
+}
+
+void bake(const std::string& vdb, const std::string& sidecar, int size, int levels,
+          trk::ControlKind kind) {
     const trk::Density density = load(vdb);
     trk::SidecarHeader header;
     header.toolVersion = "test";
@@ -104,9 +124,10 @@ void bake(const std::string& vdb, const std::string& sidecar, int size, int leve
     header.digest = density.summary.digest;
     header.indexToWorld = density.summary.indexToWorld;
     header.superVoxelSize = size;
+    header.controlKind = kind;
     header.levels = levels;
     trk::OutputFile file(sidecar, true);
-    trk::writeSidecar(file, header, vdbtools::bake(density.field, size, levels),
+    trk::writeSidecar(file, header, vdbtools::bake(density.field, bakeOptions(size, levels, kind)),
                       density.summary.anchor);
     file.commit();
 }

@@ -2,6 +2,7 @@
 // Volumes the tests make, and where they put them.
 #pragma once
 
+#include "bake.h"
 #include "io/density.h"
 #include "io/sidecar.h"
 
@@ -29,18 +30,27 @@ std::string dataFolder();
 openvdb::FloatGrid::Ptr makeGrid(const openvdb::CoordBBox& box,
                                  const std::function<float(const openvdb::Coord&)>& f);
 
+/// The same of three channels, f answering them.
+openvdb::Vec3SGrid::Ptr makeColorGrid(
+    const openvdb::CoordBBox& box, const std::function<openvdb::Vec3f(const openvdb::Coord&)>& f);
+
 /// A Gaussian blob with some texture on it, at the centre of an n^3 box.
 openvdb::FloatGrid::Ptr makeBlob(int n);
 
 /// Writes grids to path(name) and answers that path.
 std::string write(const std::string& name, const openvdb::GridCPtrVec& grids);
 
-/// The procedural cloud of n^3 voxels, made once per process.
-std::string cloudFile(int n);
+/// The procedural cloud, or another kind, of n^3 voxels, made once per process.
+std::string cloudFile(int n, const std::string& kind = "cloud");
 
 trk::Density load(const std::string& path, const std::string& grid = "");
 
 /// Bakes `vdb` to `sidecar` the way `vdbtrack bake` does.
-void bake(const std::string& vdb, const std::string& sidecar, int size, int levels = 2);
+void bake(const std::string& vdb, const std::string& sidecar, int size, int levels = 2,
+          trk::ControlKind kind = trk::ControlKind::kConstant);
+
+/// The options of such a bake.
+vdbtools::BakeOptions bakeOptions(int size, int levels,
+                                  trk::ControlKind kind = trk::ControlKind::kConstant);
 
 }  // namespace fixtures

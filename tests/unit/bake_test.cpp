@@ -92,7 +92,7 @@ BakedSuperVoxel bruteForce(const openvdb::FloatGrid& grid, const Int3& index, in
     BakedSuperVoxel result;
     result.min = static_cast<float>(lo);
     result.max = static_cast<float>(hi);
-    result.control = static_cast<float>(mean);
+    result.mean = static_cast<float>(mean);
     result.majorant = static_cast<float>(std::max(mean - lo, hi - mean));
     result.rms = static_cast<float>(std::sqrt(squares / cells));
     return result;
@@ -108,7 +108,7 @@ TEST_P(BakeSizes, StatisticsMatchTheirDefinition) {
     grid->tree().addTile(2, Coord(-256, 0, 0), 0.1f, true);
     const trk::Density d =
         fixtures::load(fixtures::write("stats" + std::to_string(size) + ".vdb", {grid}));
-    const BakedVolume baked = vdbtools::bake(d.field, size, 3);
+    const BakedVolume baked = vdbtools::bake(d.field, fixtures::bakeOptions(size, 3));
     const auto items = byIndex(baked, d.summary.anchor);
     ASSERT_GT(items.size(), 8u);
     for (const auto& [index, item] : items) {
@@ -116,17 +116,17 @@ TEST_P(BakeSizes, StatisticsMatchTheirDefinition) {
         EXPECT_EQ(item.min, expected.min);
         EXPECT_EQ(item.max, expected.max);
         EXPECT_GT(item.max, 0.0f);
-        EXPECT_FLOAT_EQ(item.control, expected.control);
+        EXPECT_FLOAT_EQ(item.mean, expected.mean);
         EXPECT_NEAR(item.rms, expected.rms,
-                    1e-6 * static_cast<double>(expected.control + expected.rms) + 1e-12);
+                    1e-6 * static_cast<double>(expected.mean + expected.rms) + 1e-12);
         // Outward: bounds of the float control, not of the mean before rounding.
         EXPECT_GE(static_cast<double>(item.majorant),
-                  std::max(static_cast<double>(item.control) - static_cast<double>(expected.min),
-                           static_cast<double>(expected.max) - static_cast<double>(item.control)));
+                  std::max(static_cast<double>(item.mean) - static_cast<double>(expected.min),
+                           static_cast<double>(expected.max) - static_cast<double>(item.mean)));
         EXPECT_FLOAT_EQ(item.majorant, expected.majorant);
         EXPECT_LE(item.rms, item.majorant);
         if (item.min == item.max) {
-            EXPECT_EQ(item.control, item.min);
+            EXPECT_EQ(item.mean, item.min);
             EXPECT_EQ(item.majorant, 0.0f);
             EXPECT_EQ(item.rms, 0.0f);
         }
@@ -150,7 +150,7 @@ TEST_P(BakeSizes, StatisticsMatchTheirDefinition) {
 TEST_P(BakeSizes, LevelsKeepTheMass) {
     const int size = GetParam();
     const trk::Density d = fixtures::load(fixtures::cloudFile(64));
-    const BakedVolume baked = vdbtools::bake(d.field, size, 3);
+    const BakedVolume baked = vdbtools::bake(d.field, fixtures::bakeOptions(size, 3));
     const auto mass = [](const trk::SparseTable& table, const auto& valueOf) {
         double sum = 0;
         table.forEach([&](const Int3&, int shift, trk::SparseTable::Entry entry) {
@@ -158,7 +158,7 @@ TEST_P(BakeSizes, LevelsKeepTheMass) {
         });
         return sum;
     };
-    const double total = mass(baked.table, [&](size_t i) { return baked.items[i].control; });
+    const double total = mass(baked.table, [&](size_t i) { return baked.items[i].mean; });
     double voxels = 0;
     openvdb::io::File file(fixtures::cloudFile(64));
     file.open();
@@ -168,7 +168,7 @@ TEST_P(BakeSizes, LevelsKeepTheMass) {
     }
     EXPECT_NEAR(total, voxels, 1e-6 * voxels);
     ASSERT_EQ(baked.levels.size(), 3u);
-    for (const trk::ScalarTable& level : baked.levels) {
+    for (const trk::ValueTable& level : baked.levels) {
         EXPECT_NEAR(mass(level.table, [&](size_t i) { return level.values[i]; }), total,
                     1e-6 * total);
     }
@@ -185,18 +185,20 @@ TEST(Bake, SameBitsWithAndWithoutTiles) {
     const trk::Density filled = fixtures::load(fixtures::write("filled.vdb", {grid}));
     EXPECT_NE(tiled.summary.digest, filled.summary.digest);
     for (const int size : {4, 8, 16, 32, 64}) {
-        expectSameBits(vdbtools::bake(tiled.field, size, 2), tiled.summary.anchor,
-                       vdbtools::bake(filled.field, size, 2), filled.summary.anchor);
+        expectSameBits(
+            vdbtools::bake(tiled.field, fixtures::bakeOptions(size, 2)), tiled.summary.anchor,
+            vdbtools::bake(filled.field, fixtures::bakeOptions(size, 2)), filled.summary.anchor);
     }
 }
 
 TEST(Bake, SameBitsForAnyNumberOfThreads) {
     const trk::Density d = fixtures::load(fixtures::cloudFile(96));
-    const BakedVolume all = vdbtools::bake(d.field, 8, 3);
+    const BakedVolume all = vdbtools::bake(d.field, fixtures::bakeOptions(8, 3));
     const tbb::global_control limit(tbb::global_control::max_allowed_parallelism, 1);
     const trk::Density again = fixtures::load(fixtures::cloudFile(96));
     EXPECT_EQ(again.summary.digest, d.summary.digest);
-    expectSameBits(all, d.summary.anchor, vdbtools::bake(again.field, 8, 3), d.summary.anchor);
+    expectSameBits(all, d.summary.anchor, vdbtools::bake(again.field, fixtures::bakeOptions(8, 3)),
+                   d.summary.anchor);
 }
 
 TEST(Bake, RealTiledAndFilledCloudsAgree) {
@@ -205,8 +207,9 @@ TEST(Bake, RealTiledAndFilledCloudsAgree) {
     const trk::Density tiled = fixtures::load(base + ".vdb");
     const trk::Density filled = fixtures::load(base + "_filled.vdb");
     for (const int size : {4, 8, 16, 32, 64}) {
-        expectSameBits(vdbtools::bake(tiled.field, size, 4), tiled.summary.anchor,
-                       vdbtools::bake(filled.field, size, 4), filled.summary.anchor);
+        expectSameBits(
+            vdbtools::bake(tiled.field, fixtures::bakeOptions(size, 4)), tiled.summary.anchor,
+            vdbtools::bake(filled.field, fixtures::bakeOptions(size, 4)), filled.summary.anchor);
     }
 }
 

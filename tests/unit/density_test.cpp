@@ -51,9 +51,9 @@ openvdb::FloatGrid::Ptr single(float value, const char* name = "density") {
 
 float densityAt(const trk::Density& density, double x, double y, double z) {
     const auto& anchor = density.summary.anchor;
-    return density.field.density(
+    return density.field.density<1>(
         {{x - static_cast<double>(anchor[0]), y - static_cast<double>(anchor[1]),
-          z - static_cast<double>(anchor[2])}});
+          z - static_cast<double>(anchor[2])}})[0];
 }
 
 TEST(LoadDensity, ChoosesTheOnlyCandidate) {

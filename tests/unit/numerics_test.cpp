@@ -115,23 +115,24 @@ TEST(SuperVoxels, BoundsCoverTheResidualOfEveryChoice) {
         baked.table = trk::SparseTable(4, {{{0, 0, 0}}, {{16, 16, 16}}});
         baked.table.fill([](const trk::Int3&, int) { return std::nullopt; },
                          [](const trk::Int3&) { return 1u; });
-        baked.items.push_back({0.1f, 0.7f, 0.3f, 0.4f, 0.2f});
+        baked.items.push_back({0.1f, 0.7f, 0.3f, 0.2f, 0.4f, 0.2f});
         const float scale = 3.3f;
-        const trk::SuperVoxels opened(std::move(baked), scale, choice, 0.05);
+        const trk::SuperVoxels opened(std::move(baked), {static_cast<double>(scale)}, choice, 0.05);
         trk::LocalRay ray;
         ray.direction[0] = 1;
         ray.inverse = {{1, 1e300, 1e300}};
         ray.tEnd = 16;
         int met = 0;
-        opened.walk(ray, 0, 16, [&](const trk::SuperVoxel& v, double, double) {
+        const auto visit = [&](const auto& v, double, double) {
             ++met;
             for (const float density : {0.1f, 0.3f, 0.7f}) {
                 const double residual = static_cast<double>(scale) * static_cast<double>(density) -
-                                        static_cast<double>(v.control);
-                EXPECT_LE(std::fabs(residual), static_cast<double>(v.bound));
+                                        static_cast<double>(v[0].control);
+                EXPECT_LE(std::fabs(residual), static_cast<double>(v[0].bound));
             }
             return true;
-        });
+        };
+        opened.walk<1, trk::ControlKind::kConstant>(ray, 0, 16, visit);
         EXPECT_EQ(met, 1);
     }
 }

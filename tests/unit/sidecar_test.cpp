@@ -75,7 +75,8 @@ void expectRefused(const Baked& baked, const std::string& sidecar, TrkStatus sta
 TEST(Sidecar, ReadsBackWhatWasWritten) {
     for (const int size : {4, 16, 64}) {
         const Baked baked = makeBaked("roundtrip" + std::to_string(size), size);
-        const trk::BakedVolume expected = vdbtools::bake(baked.density.field, size, 2);
+        const trk::BakedVolume expected =
+            vdbtools::bake(baked.density.field, fixtures::bakeOptions(size, 2));
         const trk::Sidecar read =
             trk::readSidecar(baked.sidecar, &baked.density.summary, TRK_CHECK_FULL);
         EXPECT_EQ(read.header.superVoxelSize, size);
@@ -242,7 +243,8 @@ TEST(Sidecar, LevelsOfFarPartsAreReadWhole) {
     for (const int size : {4, 16, 64}) {
         const std::string sidecar = fixtures::path("far-levels.track.vdb");
         fixtures::bake(vdb, sidecar, size, 8);
-        const trk::BakedVolume baked = vdbtools::bake(density.field, size, 8);
+        const trk::BakedVolume baked =
+            vdbtools::bake(density.field, fixtures::bakeOptions(size, 8));
         const trk::Sidecar read = trk::readSidecar(sidecar, &density.summary, TRK_CHECK_FULL);
         EXPECT_EQ(read.baked.table.occupiedItems(), baked.table.occupiedItems());
         for (size_t level = 0; level < 8; ++level) {
@@ -278,7 +280,7 @@ TEST(Verify, FindsAMissingHaloAroundATile) {
         trk::SparseTable(3, {{{lo - 8, lo - 8, lo - 8}}, {{lo + 128, lo + 128, lo + 128}}});
     wrong.baked.table.fill([](const trk::Int3&, int) { return std::nullopt; },
                            [](const trk::Int3&) { return 1u; });
-    wrong.baked.items.push_back({1, 1, 1, 0, 0});
+    wrong.baked.items.push_back({1, 1, 1, 0, 0, 0});
     EXPECT_NE(vdbtools::verify(density.summary, wrong).counterexample, "");
     wrong.baked.table = trk::SparseTable(3, {{{lo, lo, lo}}, {{lo + 128, lo + 128, lo + 128}}});
     wrong.baked.table.fill(
@@ -319,7 +321,7 @@ TEST(Verify, ProvesAGoodBakeAndFindsEveryLie) {
     EXPECT_NE(verifyChanged(&V::max, 0.999f).find("max"), std::string::npos);
     EXPECT_NE(verifyChanged(&V::majorant, 0.999f).find("majorant"), std::string::npos);
     EXPECT_NE(verifyChanged(&V::rms, 0.999f).find("RMS"), std::string::npos);
-    EXPECT_NE(verifyChanged(&V::control, 1.00001f), "");
+    EXPECT_NE(verifyChanged(&V::mean, 1.00001f), "");
 
     trk::SparseTable::Entry dropped = 0;
     trk::Sidecar holed;

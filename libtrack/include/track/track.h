@@ -79,7 +79,8 @@ enum {
     TRK_METHOD_CONTROL = 3   /**< the baked control alone: biased, no noise, for level of detail */
 };
 
-/** The constant control of the residual method, chosen per super-voxel when a volume is opened. */
+/** The control of the residual method, chosen per super-voxel when a volume is opened. Sidecars with
+ *  trilinear or affine controls know robust and mean, which is the control as baked. */
 typedef int32_t TrkChoice;
 enum {
     TRK_CHOICE_ROBUST =
@@ -106,6 +107,9 @@ typedef struct TrkVolumeOptions {
     size_t size;          /**< sizeof(TrkVolumeOptions) */
     const char* gridName; /**< NAME or NAME[i]; NULL: the only density-like grid, else "density" */
     float scale;          /**< extinction = scale x density, in 1/world unit; finite and >= 0 */
+    float color[3];       /**< extinction of channel k = scale x color[k] x density; finite and >= 0.
+                               Tints a density of one channel, which then has three unless all
+                               agree; a channel of 0 has a transmittance of exactly 1 */
     TrkChoice choice;     /**< control of TRK_METHOD_RESIDUAL */
     TrkCheck check;       /**< how far to distrust the sidecar */
     uint32_t repair;      /**< TRK_REPAIR_… bits; those the sidecar was baked with are added */
@@ -118,6 +122,7 @@ static inline TrkVolumeOptions trkDefaultVolumeOptions(void) {
     options.size = sizeof(TrkVolumeOptions);
     options.gridName = NULL;
     options.scale = 1.0f;
+    options.color[0] = options.color[1] = options.color[2] = 1.0f;
     options.choice = TRK_CHOICE_ROBUST;
     options.check = TRK_CHECK_FULL;
     options.repair = 0;
@@ -189,12 +194,12 @@ typedef struct TrkVolumeInfo {
     uint64_t activeVoxels;    /**< of the source grid; 0 where only a sidecar is open */
     uint64_t bytes;           /**< held by the volume */
     uint64_t superVoxelCount; /**< occupied ones; 0 where there is no sidecar */
-    uint32_t channels;        /**< floats per ray that estimates write: 1 */
+    uint32_t channels;        /**< values per ray that queries write: 1 or 3 */
     uint32_t hasDensity;      /**< 1 where exact, residual and ratio have what they look up */
     uint32_t superVoxelSize;  /**< in voxels; 0 where there is no sidecar */
     uint32_t levels;          /**< preview levels above 0 */
     const char* gridName;     /**< of the source grid */
-    const char* controlKind;  /**< "constant", or "" where there is no sidecar */
+    const char* controlKind;  /**< "constant", "trilinear" or "affine"; "" without a sidecar */
     const char* storage;      /**< "float" or "half", "" where only a sidecar is open */
 } TrkVolumeInfo;
 

@@ -7,12 +7,17 @@
 
 namespace trk {
 
-/// Optical depth of the whole ray. `unit`: extinction x world length of a density of 1 over one
-/// voxel length along this ray.
+/// Optical depth of the whole ray, per channel. `lengthPerVoxel`: world length of one voxel length
+/// along the ray.
 template <class Field>
-double exactOpticalDepth(const Field& field, const LocalRay& ray, double unit, PathCost& cost) {
+std::array<double, Field::kChannels> exactOpticalDepth(const Field& field, const LocalRay& ray,
+                                                       double lengthPerVoxel, PathCost& cost) {
     cost.exactLength += ray.tEnd;
-    return unit * field.integrate(ray, 0, ray.tEnd, cost.lookups, cost.superVoxels);
+    auto depth = field.integrate(ray, 0, ray.tEnd, cost.lookups, cost.superVoxels);
+    for (double& d : depth) {
+        d *= lengthPerVoxel;
+    }
+    return depth;
 }
 
 }  // namespace trk

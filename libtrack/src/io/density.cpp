@@ -2,6 +2,7 @@
 #include "density.h"
 
 #include "../error.h"
+#include "density_types.h"
 #include "field_builder.h"
 #include "vdb_file.h"
 
@@ -12,15 +13,17 @@
 namespace trk {
 namespace {
 
-bool isScalar(const std::string& type) {
-    return type == openvdb::FloatTree::treeType() || type == openvdb::DoubleTree::treeType();
-}
-
-/// "Tree_vec3s_5_4_3" -> "vec3s".
-std::string valueTypeName(const std::string& type) {
-    const size_t first = type.find('_');
-    const size_t last = type.find('_', first + 1);
-    return first == std::string::npos ? type : type.substr(first + 1, last - first - 1);
+/// Whether a grid may be meant to be a density, by its class.
+bool isCandidate(const VdbEntry& entry, const openvdb::GridBase& grid) {
+    const openvdb::GridClass gridClass = grid.getGridClass();
+    switch (channelCount(valueTypeName(entry.type))) {
+        case 1:
+            return gridClass == openvdb::GRID_FOG_VOLUME || gridClass == openvdb::GRID_UNKNOWN;
+        case 3:
+            return gridClass == openvdb::GRID_FOG_VOLUME;
+        default:
+            return false;
+    }
 }
 
 /// The grid asked for, or the only one that can be a density, else "density".
@@ -34,11 +37,8 @@ const VdbEntry& choose(VdbFile& file, const DensityOptions& options) {
     std::vector<const VdbEntry*> candidates;
     bool hasDensity = false;
     for (const VdbEntry& entry : file.entries()) {
-        if (!isScalar(entry.type)) {
-            continue;
-        }
-        const openvdb::GridClass gridClass = file.readMetadata(entry)->getGridClass();
-        if (gridClass == openvdb::GRID_FOG_VOLUME || gridClass == openvdb::GRID_UNKNOWN) {
+        const openvdb::GridBase::Ptr grid = file.readMetadata(entry);
+        if (grid && isCandidate(entry, *grid)) {
             candidates.push_back(&entry);
             hasDensity = hasDensity || entry.name == "density";
         }
@@ -69,10 +69,11 @@ const VdbEntry& choose(VdbFile& file, const DensityOptions& options) {
 void checkKind(const VdbEntry& entry, const openvdb::GridBase* grid, const std::string& where) {
     const auto refuse = [&](const std::string& found) {
         throw Error(TRK_ERROR_UNSUPPORTED_GRID,
-                    where + ": is " + found + "; expected a float or double fog volume");
+                    where + ": is " + found + "; expected a fog volume of float, double, vec3s or vec3d");
     };
-    if (!grid || !isScalar(entry.type)) {
-        refuse("of type " + valueTypeName(entry.type));
+    const std::string valueType = valueTypeName(entry.type);
+    if (!grid || channelCount(valueType) == 0) {
+        refuse("of type " + valueType);
     }
     switch (grid->getGridClass()) {
         case openvdb::GRID_LEVEL_SET:
@@ -86,9 +87,10 @@ void checkKind(const VdbEntry& entry, const openvdb::GridBase* grid, const std::
     }
 }
 
-void checkValues(const TreeScan& scan, double background, uint32_t repair,
+template <class Value>
+void checkValues(const TreeScan& scan, const Value& background, uint32_t repair,
                  const std::string& where) {
-    if (!(background == 0)) {
+    if (!(background == openvdb::zeroVal<Value>())) {
         std::ostringstream line;
         line << where << ": background is " << background
              << "; expected 0, or the extinction has no end";
@@ -115,7 +117,7 @@ Density convert(const GridType& grid, const DensityOptions& options, const std::
     DensitySummary& summary = density.summary;
     const FieldBuilder<typename GridType::TreeType> builder(grid.constTree());
     const TreeScan& scan = builder.scan();
-    checkValues(scan, static_cast<double>(grid.background()), options.repair, where);
+    checkValues(scan, grid.background(), options.repair, where);
     summary.digest = scan.digest;
     summary.activeVoxels = scan.activeVoxels;
     summary.gridBytes = grid.memUsage();
@@ -140,13 +142,12 @@ Density loadDensity(const std::string& path, const DensityOptions& options) {
     const AffineMap map = affineMap(metadata->constTransform(), where);
 
     openvdb::GridBase::Ptr grid = file.read(entry, options.maxMemory);
-    const bool isDouble = entry.type == openvdb::DoubleTree::treeType();
-    Density density = isDouble
-                          ? convert(static_cast<const openvdb::DoubleGrid&>(*grid), options, where)
-                          : convert(static_cast<const openvdb::FloatGrid&>(*grid), options, where);
+    Density density;
+    grid->apply<DensityGrids>(
+        [&](const auto& typed) { density = convert(typed, options, where); });
     density.summary.path = path;
     density.summary.grid = {entry.name, entry.index};
-    density.summary.valueType = isDouble ? "double" : "float";
+    density.summary.valueType = valueTypeName(entry.type);
     density.summary.indexToWorld = map;
     return density;
 }

@@ -22,7 +22,7 @@ struct DensityOptions {
 struct DensitySummary {
     std::string path;
     GridIdentity grid;
-    std::string valueType;  ///< "float" or "double"
+    std::string valueType;  ///< "float", "double", "vec3s" or "vec3d"
     AffineMap indexToWorld;
     Int3 anchor{{0, 0, 0}};
     uint64_t digest = 0;  ///< of origins, levels, masks and values as stored, before any repair
@@ -40,8 +40,9 @@ struct Density {
     ExtinctionField field;  ///< in local space: index space minus summary.anchor
 };
 
-/// Loads, checks and converts a grid, in parallel. Without a name: the only scalar grid that could
-/// be a density, else "density". Throws Error.
+/// Loads, checks and converts a grid, in parallel. Without a name: the only grid that could be a
+/// density (scalars of class fog volume or unknown, vectors of class fog volume: others may be
+/// velocities), else "density". Throws Error.
 Density loadDensity(const std::string& path, const DensityOptions& options);
 
 }  // namespace trk

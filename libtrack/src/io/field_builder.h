@@ -6,6 +6,7 @@
 #include "../error.h"
 #include "../extinction_field.h"
 #include "../hash.h"
+#include "density_types.h"
 #include "tree_regions.h"
 
 #include <openvdb/openvdb.h>
@@ -84,9 +85,11 @@ class FieldBuilder {
 
   private:
     static constexpr size_t kBrickVertices = ExtinctionField::kBrickVertices;
+    static constexpr size_t kChannels = ValueTraits<Value>::kChannels;
     using Regions = TreeRegions<TreeType>;
-    using Vertices = std::array<float, kBrickVertices>;
-    using CornerValues = std::array<float, 8>;
+    using FieldValue = Sample<Value>;
+    using Vertices = std::array<FieldValue, kBrickVertices>;
+    using CornerValues = std::array<FieldValue, 8>;
 
     struct Tile {
         openvdb::Coord origin;
@@ -108,17 +111,18 @@ class FieldBuilder {
         SparseTable table;
         std::vector<Job> jobs;
         std::vector<float> constants;
-        std::map<float, Entry> constantEntries;
+        std::map<FieldValue, Entry> constantEntries;
         std::map<std::pair<int, CornerValues>, Entry> shared;
 
-        Entry constantEntry(float value) {
-            if (value == 0) {
+        Entry constantEntry(const FieldValue& value) {
+            if (value == FieldValue{}) {
                 return SparseTable::kEmpty;
             }
+            const size_t next = constants.size() / kChannels;
             const auto [it, isNew] = constantEntries.try_emplace(
-                value, static_cast<Entry>(constants.size()) | ExtinctionField::kConstantFlag);
+                value, static_cast<Entry>(next) | ExtinctionField::kConstantFlag);
             if (isNew) {
-                constants.push_back(value);
+                constants.insert(constants.end(), value.begin(), value.end());
             }
             return it->second;
         }
@@ -130,7 +134,7 @@ class FieldBuilder {
         /// Such regions look alike all over the surface of a tile, so they are built once.
         Entry sharedEntry(int shift, const CornerValues& values) {
             if (std::all_of(values.begin(), values.end(),
-                            [&](float v) { return v == values[0]; })) {
+                            [&](const FieldValue& v) { return v == values[0]; })) {
                 return constantEntry(values[0]);
             }
             const auto key = std::make_pair(shift, values);
@@ -160,23 +164,20 @@ class FieldBuilder {
         }
     };
 
-    /// The value as the field holds it: repaired, float, without negative zero.
-    static float fieldValue(Value value) {
-        const auto v = static_cast<float>(value);
-        return v > 0 && std::isfinite(v) ? v : 0.0f;
-    }
-
-    static void scanValue(Value value, const openvdb::Coord& at, uint64_t count, TreeScan& scan) {
-        const auto v = static_cast<float>(value);
+    static void scanValue(const Value& value, const openvdb::Coord& at, uint64_t count,
+                          TreeScan& scan) {
+        const FieldValue floats = toFloats(value);
         const Int3 where{{at.x(), at.y(), at.z()}};
-        if (!std::isfinite(v)) {  // a double beyond float's range is infinite to the field
+        // A double beyond float's range is infinite to the field.
+        if (!std::all_of(floats.begin(), floats.end(), [](float v) { return std::isfinite(v); })) {
             scan.nonfinite.add(count, where);
-        } else if (v < 0) {
+        } else if (std::any_of(floats.begin(), floats.end(), [](float v) { return v < 0; })) {
             scan.negative.add(count, where);
         }
-        const float f = fieldValue(value);
-        scan.addRange(f, f);
-        scan.exactHalfs = scan.exactHalfs && isExactHalf(f);
+        for (const float f : fieldValue(value)) {
+            scan.addRange(f, f);
+            scan.exactHalfs = scan.exactHalfs && isExactHalf(f);
+        }
     }
 
     static void addSupport(const openvdb::Coord& origin, int64_t size, TreeScan& scan) {
@@ -189,7 +190,8 @@ class FieldBuilder {
     void scanTree();
 
     static void gather(Regions& regions, const Job& job, Vertices& out);
-    static void gatherCorner(const Leaf* leaf, float value, size_t corner, Vertices& out);
+    static void gatherCorner(const Leaf* leaf, const FieldValue& value, size_t corner,
+                             Vertices& out);
 
     const TreeType& tree_;
     std::vector<const Leaf*> leaves_;
@@ -211,19 +213,21 @@ void FieldBuilder<TreeType>::scanLeaf(const Leaf& leaf, TreeScan& scan) {
     scan.activeVoxels += leaf.onVoxelCount();
 
     // First branch-free over all, as nearly every leaf is fine; then, where not, voxel by voxel.
+    constexpr size_t kCount = Leaf::SIZE * kChannels;
+    const auto* components = ValueTraits<Value>::components(values);
     bool fine = true;
-    auto lo = static_cast<float>(values[0]);
+    auto lo = static_cast<float>(components[0]);
     float hi = lo;
-    for (openvdb::Index i = 0; i < Leaf::SIZE; ++i) {
-        const auto v = static_cast<float>(values[i]);
+    for (size_t i = 0; i < kCount; ++i) {
+        const auto v = static_cast<float>(components[i]);
         fine = fine & (v >= 0) & (v <= std::numeric_limits<float>::max());
         lo = std::min(lo, v);
         hi = std::max(hi, v);
     }
     if (fine) {
         scan.addRange(lo, hi);
-        for (openvdb::Index i = 0; i < Leaf::SIZE && scan.exactHalfs; ++i) {
-            scan.exactHalfs = isExactHalf(static_cast<float>(values[i]));
+        for (size_t i = 0; i < kCount && scan.exactHalfs; ++i) {
+            scan.exactHalfs = isExactHalf(static_cast<float>(components[i]));
         }
     } else {
         for (openvdb::Index i = 0; i < Leaf::SIZE; ++i) {
@@ -240,19 +244,24 @@ void FieldBuilder<TreeType>::scanTile(const Tile& tile, TreeScan& scan) {
     const int64_t size = int64_t{1} << tile.shift;
     const auto voxels = static_cast<uint64_t>(size * size * size);
     const int32_t key[4] = {tile.origin.x(), tile.origin.y(), tile.origin.z(), tile.shift};
-    const double value[2] = {static_cast<double>(tile.value), tile.active ? 1.0 : 0.0};
-    scan.digest += hashWords(value, 2, hashWords(key, 2, 1));
+    double value[kChannels + 1];
+    for (size_t c = 0; c < kChannels; ++c) {
+        value[c] = static_cast<double>(ValueTraits<Value>::components(&tile.value)[c]);
+    }
+    value[kChannels] = tile.active ? 1.0 : 0.0;
+    scan.digest += hashWords(value, kChannels + 1, hashWords(key, 2, 1));
     scan.activeVoxels += tile.active ? voxels : 0;
     scanValue(tile.value, tile.origin, voxels, scan);
-    if (!(tile.value == 0)) {
+    if (!(tile.value == openvdb::zeroVal<Value>())) {
         addSupport(tile.origin, size, scan);
     }
 }
 
 template <class TreeType>
 void FieldBuilder<TreeType>::scanTree() {
-    const auto addTile = [&](const openvdb::Coord& origin, int shift, Value value, bool active) {
-        if (active || !(value == 0)) {
+    const auto addTile = [&](const openvdb::Coord& origin, int shift, const Value& value,
+                             bool active) {
+        if (active || !(value == openvdb::zeroVal<Value>())) {
             tiles_.push_back({origin, shift, value, active});
         }
     };
@@ -296,7 +305,7 @@ void FieldBuilder<TreeType>::scanTree() {
 }
 
 template <class TreeType>
-void FieldBuilder<TreeType>::gatherCorner(const Leaf* leaf, float value, size_t corner,
+void FieldBuilder<TreeType>::gatherCorner(const Leaf* leaf, const FieldValue& value, size_t corner,
                                           Vertices& out) {
     // The brick's own region gives 8 vertices an axis, an upper neighbour the one of the apron.
     const size_t nx = corner & 4 ? 1 : 8;
@@ -307,7 +316,7 @@ void FieldBuilder<TreeType>::gatherCorner(const Leaf* leaf, float value, size_t 
     const Value* values = leaf ? leaf->buffer().data() : nullptr;
     for (size_t x = 0; x < nx; ++x) {
         for (size_t y = 0; y < ny; ++y) {
-            float* row = &out[first + x * 81 + y * 9];
+            FieldValue* row = &out[first + x * 81 + y * 9];
             for (size_t z = 0; z < nz; ++z) {
                 row[z] = values ? fieldValue(values[x << 6 | y << 3 | z]) : value;
             }
@@ -325,7 +334,7 @@ void FieldBuilder<TreeType>::gather(Regions& regions, const Job& job, Vertices& 
         const Int3 at{{job.origin[0] + (corner & 4 ? 8 : 0), job.origin[1] + (corner & 2 ? 8 : 0),
                        job.origin[2] + (corner & 1 ? 8 : 0)}};
         const Leaf* leaf = regions.leaf(at);
-        gatherCorner(leaf, leaf ? 0.0f : fieldValue(regions.value(at)), corner, out);
+        gatherCorner(leaf, leaf ? FieldValue{} : fieldValue(regions.value(at)), corner, out);
     }
 }
 
@@ -376,20 +385,21 @@ ExtinctionField FieldBuilder<TreeType>::build(const Int3& anchor, uint64_t maxMe
                               }
                           });
     };
-    constexpr float kNotConstant = -1;
-    std::vector<float> constantOf(jobCount);
+    FieldValue notConstant;
+    notConstant.fill(-1);
+    std::vector<FieldValue> constantOf(jobCount);
     forEachJob([&](size_t i, const Vertices& vertices) {
         const bool same = std::all_of(vertices.begin(), vertices.end(),
-                                      [&](float v) { return v == vertices[0]; });
-        constantOf[i] = same ? vertices[0] : kNotConstant;
+                                      [&](const FieldValue& v) { return v == vertices[0]; });
+        constantOf[i] = same ? vertices[0] : notConstant;
     });
     std::vector<Entry> entryOf(jobCount);
     size_t brickCount = 0;
     for (size_t i = 0; i < jobCount; ++i) {
-        entryOf[i] = constantOf[i] == kNotConstant ? static_cast<Entry>(++brickCount)
+        entryOf[i] = constantOf[i] == notConstant ? static_cast<Entry>(++brickCount)
                                                    : plan.constantEntry(constantOf[i]);
     }
-    const size_t valueCount = brickCount * kBrickVertices;
+    const size_t valueCount = brickCount * kBrickVertices * kChannels;
     const uint64_t wanted = valueCount * (scan_.exactHalfs ? 2 : 4);
     if (maxMemory > 0 && wanted > maxMemory) {
         throw Error(TRK_ERROR_OUT_OF_MEMORY, where + ": needs " + std::to_string(wanted) +
@@ -402,20 +412,23 @@ ExtinctionField FieldBuilder<TreeType>::build(const Int3& anchor, uint64_t maxMe
     std::vector<float> floats(scan_.exactHalfs ? 0 : valueCount);
     std::vector<uint16_t> halfs(scan_.exactHalfs ? valueCount : 0);
     forEachJob([&](size_t i, const Vertices& vertices) {
-        if (constantOf[i] != kNotConstant) {
+        if (constantOf[i] != notConstant) {
             return;
         }
-        const size_t first = (entryOf[i] - 1) * kBrickVertices;
-        if (scan_.exactHalfs) {
-            std::transform(vertices.begin(), vertices.end(), &halfs[first], encodeHalf);
-        } else {
-            std::copy(vertices.begin(), vertices.end(), &floats[first]);
+        size_t at = (entryOf[i] - 1) * kBrickVertices * kChannels;
+        for (const FieldValue& vertex : vertices) {
+            if (scan_.exactHalfs) {
+                std::transform(vertex.begin(), vertex.end(), &halfs[at], encodeHalf);
+            } else {
+                std::copy(vertex.begin(), vertex.end(), &floats[at]);
+            }
+            at += kChannels;
         }
     });
     SparseTable table = plan.table.mapped([&](Entry entry) {
         return entry & ExtinctionField::kConstantFlag ? entry : entryOf[entry - 1];
     });
-    return {std::move(table), std::move(plan.constants), std::move(floats), std::move(halfs)};
+    return {kChannels, std::move(table), std::move(plan.constants), std::move(floats), std::move(halfs)};
 }
 
 }  // namespace trk

@@ -24,12 +24,19 @@ class GuardedFileBuf : public std::filebuf {
   public:
     enum class Codec { kUnguarded, kZip, kBlosc };
 
+    /// The values of a chunk.
+    struct Values {
+        size_t size = 0;               ///< bytes of one in the file
+        bool half = false;             ///< made of halfs
+        bool mayBeEightBytes = false;  ///< an inactive one is stored in as many as a size is
+    };
+
     /// Before each grid. `codec`: of its chunks; kUnguarded where they have no size before them, or
-    /// are not of floats or doubles. `valueSize`: bytes of a value in the file. `maskCompressed`:
-    /// whether inactive values are left out.
-    void beginGrid(Codec codec, size_t valueSize, bool maskCompressed) {
+    /// are of other values than a density's. `maskCompressed`: whether inactive values are left
+    /// out.
+    void beginGrid(Codec codec, const Values& values, bool maskCompressed) {
         codec_ = codec;
-        valueSize_ = valueSize;
+        values_ = values;
         maskCompressed_ = maskCompressed;
         afterMask_ = false;
         expected_ = chunkSize_ = kNothing;
@@ -93,15 +100,15 @@ class GuardedFileBuf : public std::filebuf {
         }
         if (size == 1 && afterMask_) {
             const bool everything = !maskCompressed_ || bytes[0] == kAllValues;
-            expected_ = static_cast<std::streamsize>((everything ? all_ : active_) * valueSize_);
-            if (expected_ == 0 && valueSize_ == 2) {  // no halfs, no chunk; no floats, an empty one
+            expected_ = static_cast<std::streamsize>((everything ? all_ : active_) * values_.size);
+            if (expected_ == 0 && values_.half) {  // no halfs, no chunk; no floats, an empty one
                 expected_ = kNothing;
             }
         } else if (size == 8 && expected_ != kNothing) {
             int64_t chunkSize;
             std::memcpy(&chunkSize, bytes, sizeof(chunkSize));
             // (Before a chunk of doubles, eight bytes may also be an inactive value.)
-            if (valueSize_ < sizeof(double) && chunkSize > expected_ + expected_ / 8 + 1024) {
+            if (!values_.mayBeEightBytes && chunkSize > expected_ + expected_ / 8 + 1024) {
                 refuse(chunkSize);
             }
             chunkSize_ = chunkSize;
@@ -113,7 +120,7 @@ class GuardedFileBuf : public std::filebuf {
     }
 
     Codec codec_ = Codec::kUnguarded;
-    size_t valueSize_ = 0;
+    Values values_;
     bool maskCompressed_ = false;
     bool afterMask_ = false;
     size_t active_ = 0;  // values of the last mask, and all that it has room for

@@ -17,11 +17,11 @@ struct SidecarHeader {
     std::string toolVersion;
     std::string sourceFile;  ///< base name, informative
     GridIdentity source;
-    std::string valueType = "float";  ///< of the source grid and of the sidecar's
+    std::string valueType = "float";  ///< of the source grid and of the sidecar's statistics
     uint64_t digest = 0;
     AffineMap indexToWorld;  ///< the source's
     int superVoxelSize = 16;
-    std::string controlKind = "constant";
+    ControlKind controlKind = ControlKind::kConstant;
     int levels = 0;
     uint32_t repair = 0;  ///< TRK_REPAIR_… bits the bake was allowed
     uint64_t dropped = 0;

@@ -3,6 +3,7 @@
 
 #include "../error.h"
 #include "../hash.h"
+#include "density_types.h"
 #include "sidecar_schema.h"
 #include "tree_regions.h"
 #include "vdb_file.h"
@@ -12,6 +13,8 @@
 #include <cmath>
 #include <cstdio>
 #include <cstdlib>
+#include <cstring>
+#include <type_traits>
 #include <unordered_map>
 #include <utility>
 #include <vector>
@@ -57,7 +60,7 @@ void checkFormat(const openvdb::GridBase& grid, const std::string& where) {
 
 /// The grid whose name ends in _control; others are found from its prefix.
 const VdbEntry* findControl(const VdbFile& file) {
-    const std::string suffix = kStatistics[0].suffix;
+    const std::string suffix = kControlSuffix;
     for (const VdbEntry& entry : file.entries()) {
         if (entry.name.size() > suffix.size() &&
             entry.name.compare(entry.name.size() - suffix.size(), suffix.size(), suffix) == 0) {
@@ -89,7 +92,6 @@ SidecarHeader readHeader(VdbFile& file) {
     header.digest =
         std::strtoull(metaText(*grid, "track_source_digest", where).c_str(), nullptr, 16);
     header.superVoxelSize = metaNumber(*grid, "track_super_voxel_size", where);
-    header.controlKind = metaText(*grid, "track_control", where);
     header.levels = metaNumber(*grid, "track_levels", where);
     header.valueType = grid->valueType();
     const int size = header.superVoxelSize;
@@ -100,12 +102,25 @@ SidecarHeader readHeader(VdbFile& file) {
     if (header.levels < 0 || header.levels > 8) {
         badSidecar(where, std::to_string(header.levels) + " levels; expected 0 to 8");
     }
+    const std::string kind = metaText(*grid, "track_control", where);
     const std::string interpolation = metaText(*grid, "track_interpolation", where);
-    if (header.controlKind != "constant" || interpolation != kInterpolation) {
+    bool known = false;
+    for (const ControlKind k :
+         {ControlKind::kConstant, ControlKind::kTrilinear, ControlKind::kAffine}) {
+        if (kind == controlName(k)) {
+            header.controlKind = k;
+            known = true;
+        }
+    }
+    if (!known || interpolation != kInterpolation) {
         throw Error(TRK_ERROR_SIDECAR_MISMATCH,
-                    where + ": control \"" + header.controlKind + "\" of interpolation \"" +
-                        interpolation +
-                        "\"; this build reads constant controls of trilinear fields");
+                    where + ": control \"" + kind + "\" of interpolation \"" + interpolation +
+                        "\"; this build reads constant, trilinear and affine controls of "
+                        "trilinear fields");
+    }
+    if (channelCount(header.valueType) == 0) {
+        badSidecar(where, "is of type " + header.valueType +
+                              "; expected float, double, vec3s or vec3d");
     }
     if (const auto meta = grid->getMetadata<openvdb::Int64Metadata>("track_dropped_nonfinite")) {
         header.repair |= TRK_REPAIR_DROP_NONFINITE;
@@ -115,7 +130,9 @@ SidecarHeader readHeader(VdbFile& file) {
         header.repair |= TRK_REPAIR_CLAMP_NEGATIVE;
         header.clamped = static_cast<uint64_t>(meta->value());
     }
-    header.indexToWorld = sourceMap(affineMap(grid->constTransform(), where), size);
+    const bool atCorners = header.controlKind == ControlKind::kTrilinear;
+    header.indexToWorld = sourceMap(affineMap(grid->constTransform(), where), size,
+                                    atCorners ? 0 : centreOffset(size));
     return header;
 }
 
@@ -164,104 +181,184 @@ const VdbEntry& findGrid(const VdbFile& file, const std::string& name) {
     badSidecar(file.path(), "grid " + name + " is missing; the file has " + file.listing());
 }
 
-template <class TreeType>
 class SidecarReader {
   public:
-    using GridType = openvdb::Grid<TreeType>;
-    using Regions = TreeRegions<TreeType>;
-    using Entries = std::array<SparseTable::Entry, 6>;  // one a statistic; an even number, to hash
-
     SidecarReader(VdbFile& file, const SidecarHeader& header, TrkCheck check)
-        : file_(file), header_(header), check_(check) {}
+        : file_(file),
+          header_(header),
+          check_(check),
+          prefix_(gridPrefix(header.source.name)),
+          channels_(static_cast<size_t>(channelCount(header.valueType))),
+          statistics_(statistics(header.controlKind)) {
+        while (1 << shift_ < header.superVoxelSize) {
+            ++shift_;
+        }
+    }
 
     void read(const Int3* anchor, Sidecar& sidecar) {
-        const std::string prefix = gridPrefix(header_.source.name);
-        int shift = 0;
-        while (1 << shift < header_.superVoxelSize) {
-            ++shift;
-        }
         BakedVolume& baked = sidecar.baked;
-        baked.superVoxelShift = shift;
-
+        baked.superVoxelShift = shift_;
+        baked.channels = channels_;
+        baked.kind = header_.controlKind;
         // Grids are read one by one and kept as tables, which share what repeats.
-        std::vector<ScalarTable> tables;
-        for (const Statistic& statistic : kStatistics) {
-            const auto grid = readGrid(prefix + statistic.suffix, shift);
-            const IntBox support = supportBox(grid->tree(), shift);
-            if (tables.empty()) {
-                box_ = support;
-                sidecar.anchor = anchor ? *anchor : anchorFor(box_);
-            }
-            if (support.lo != box_.lo || support.hi != box_.hi) {
-                badSidecar(file_.path(), "grid " + grid->getName() + " covers another box than " +
-                                             prefix + kStatistics[0].suffix);
-            }
-            checkAnchor(support, sidecar.anchor, grid->getName());
-            tables.push_back(makeTable(*grid, shift, sidecar.anchor));
+        for (const Statistic& statistic : statistics_) {
+            readItems(header_.valueType, statistic.suffix, Values::kNotNegative, anchor, sidecar);
         }
-        join(tables, sidecar);
-        tables.clear();
+        if (baked.kind == ControlKind::kAffine) {
+            for (const std::string& suffix : gradientSuffixes(channels_)) {
+                readItems(vectorType(header_.valueType), suffix, Values::kSigned, anchor, sidecar);
+            }
+        } else if (baked.kind == ControlKind::kTrilinear) {
+            const auto grid = readGrid(header_.valueType, kControlSuffix, shift_, 0);
+            checkAnchor(supportBox(*grid, shift_), sidecar.anchor, grid->getName());
+            corners_ = makeTable(*grid, shift_, sidecar.anchor, Values::kNotNegative);
+        }
+        join(sidecar);
+        tables_.clear();
         for (int level = 1; level <= header_.levels; ++level) {
-            const auto grid = readGrid(prefix + levelSuffix(level), shift + level);
-            checkAnchor(supportBox(grid->tree(), shift + level), sidecar.anchor, grid->getName());
-            baked.levels.push_back(makeTable(*grid, shift + level, sidecar.anchor));
+            const int shift = shift_ + level;
+            const auto grid = readGrid(header_.valueType, levelSuffix(level), shift,
+                                       centreOffset(1 << shift));
+            checkAnchor(supportBox(*grid, shift), sidecar.anchor, grid->getName());
+            baked.levels.push_back(
+                makeTable(*grid, shift, sidecar.anchor, Values::kNotNegative));
         }
     }
 
   private:
-    /// Makes super-voxels of the tables of their statistics; equal super-voxels are one item.
-    void join(const std::vector<ScalarTable>& tables, Sidecar& sidecar) const {
-        struct Hash {
-            size_t operator()(const Entries& entries) const {
-                return hashWords(entries.data(), entries.size() / 2, 0);
-            }
-        };
+    enum class Values { kNotNegative, kSigned };
+
+    /// Entries that make a super-voxel: of at most six statistics and three gradients or eight
+    /// corners; an even number, to hash.
+    using Entries = std::array<SparseTable::Entry, 16>;
+    struct Hash {
+        size_t operator()(const Entries& entries) const {
+            return hashWords(entries.data(), entries.size() / 2, 0);
+        }
+    };
+
+    /// Reads a grid of one value per super-voxel; all of them cover one box.
+    void readItems(const std::string& valueType, const std::string& suffix, Values values,
+                   const Int3* anchor, Sidecar& sidecar) {
+        const auto grid =
+            readGrid(valueType, suffix, shift_, centreOffset(header_.superVoxelSize));
+        const IntBox support = supportBox(*grid, shift_);
+        if (tables_.empty()) {
+            box_ = support;
+            sidecar.anchor = anchor ? *anchor : anchorFor(box_);
+        }
+        if (support.lo != box_.lo || support.hi != box_.hi) {
+            badSidecar(file_.path(), "grid " + grid->getName() + " covers another box than " +
+                                         prefix_ + statistics_[0].suffix);
+        }
+        checkAnchor(support, sidecar.anchor, grid->getName());
+        tables_.push_back(makeTable(*grid, shift_, sidecar.anchor, values));
+    }
+
+    /// Makes super-voxels of the tables of their statistics and shapes; equal ones are one.
+    void join(Sidecar& sidecar) const {
         BakedVolume& baked = sidecar.baked;
+        const bool trilinear = baked.kind == ControlKind::kTrilinear;
         std::unordered_map<Entries, SparseTable::Entry, Hash> known;
-        baked.table = SparseTable(baked.superVoxelShift, toLocal(box_, sidecar.anchor));
-        const auto itemOf = [&](const Entries& entries, const Int3& local) {
-            const auto [it, isNew] =
-                known.try_emplace(entries, static_cast<SparseTable::Entry>(known.size() + 1));
-            if (isNew) {
-                BakedSuperVoxel item;
-                for (size_t i = 0; i < tables.size(); ++i) {
-                    item.*kStatistics[i].value = tables[i].values[entries[i] - 1];
-                }
-                if (check_ == TRK_CHECK_FULL) {
-                    checkItem(item, superVoxel(local, baked.superVoxelShift, sidecar.anchor));
-                }
-                baked.items.push_back(item);
-            }
-            return it->second;
-        };
+        baked.table = SparseTable(shift_, toLocal(box_, sidecar.anchor));
         baked.table.fill(
             [&](const Int3& local, int shift) -> std::optional<SparseTable::Entry> {
                 Entries entries{};
                 size_t empty = 0;
-                for (size_t i = 0; i < tables.size(); ++i) {
-                    const auto entry = tables[i].table.uniformEntry(local, shift);
+                for (size_t i = 0; i < tables_.size(); ++i) {
+                    const auto entry = tables_[i].table.uniformEntry(local, shift);
                     if (!entry) {
                         return std::nullopt;
                     }
                     entries[i] = *entry;
                     empty += *entry == SparseTable::kEmpty ? 1 : 0;
                 }
-                if (empty == tables.size()) {
+                if (empty == tables_.size()) {
                     return SparseTable::kEmpty;
                 }
+                const Int3 at = superVoxel(local, shift_, sidecar.anchor);
                 if (empty > 0) {
                     badSidecar(file_.path(),
                                "its grids are not active in the same super-voxels: see " +
-                                   where(superVoxel(local, baked.superVoxelShift, sidecar.anchor)));
+                                   where(at));
                 }
-                return itemOf(entries, local);
+                const bool varies =
+                    baked.kind != ControlKind::kConstant && !isHomogeneous(entries);
+                if (varies && shift > shift_) {
+                    return std::nullopt;
+                }
+                for (size_t corner = 0; varies && trilinear && corner < 8; ++corner) {
+                    const int64_t size = header_.superVoxelSize;
+                    entries[tables_.size() + corner] =
+                        corners_.table
+                            .find(local[0] + (corner & 4 ? size : 0),
+                                  local[1] + (corner & 2 ? size : 0),
+                                  local[2] + (corner & 1 ? size : 0))
+                            .entry;
+                }
+                const auto [it, isNew] = known.try_emplace(
+                    entries, static_cast<SparseTable::Entry>(known.size() + 1) |
+                                 (varies ? SparseTable::kSingleFlag : 0));
+                if (isNew) {
+                    addItems(entries, varies, at, baked);
+                }
+                return it->second;
             },
             [](const Int3&) { return SparseTable::kEmpty; },  // a super-voxel is always uniform
             [&](const Int3& local, int shift, SparseTable::Key& key) {
-                return std::all_of(tables.begin(), tables.end(), [&](const ScalarTable& table) {
-                    return table.table.appendKey(local, shift, key);
-                });
+                // Corners belong to neighbours too, which such a key does not know.
+                return !trilinear &&
+                       std::all_of(tables_.begin(), tables_.end(), [&](const ValueTable& table) {
+                           return table.table.appendKey(local, shift, key);
+                       });
             });
+    }
+
+    float valueOf(const ValueTable& table, SparseTable::Entry entry, size_t channel) const {
+        return entry == SparseTable::kEmpty ? 0.0f
+                                            : table.values[(entry - 1) * channels_ + channel];
+    }
+
+    BakedSuperVoxel itemOf(const Entries& entries, size_t channel) const {
+        BakedSuperVoxel item;
+        for (size_t i = 0; i < statistics_.size(); ++i) {
+            item.*statistics_[i].value = valueOf(tables_[i], entries[i], channel);
+        }
+        if (header_.controlKind == ControlKind::kConstant) {
+            item.deviation = item.rms;
+        }
+        return item;
+    }
+
+    bool isHomogeneous(const Entries& entries) const {
+        bool homogeneous = true;
+        for (size_t c = 0; c < channels_; ++c) {
+            const BakedSuperVoxel item = itemOf(entries, c);
+            homogeneous = homogeneous && item.min == item.max;
+        }
+        return homogeneous;
+    }
+
+    /// Adds a super-voxel: an item and a shape for each channel.
+    void addItems(const Entries& entries, bool varies, const Int3& at, BakedVolume& baked) const {
+        for (size_t c = 0; c < channels_; ++c) {
+            const BakedSuperVoxel item = itemOf(entries, c);
+            const size_t size = shapeSize(baked.kind);
+            for (size_t k = 0; k < size; ++k) {
+                float value = baked.kind == ControlKind::kTrilinear ? item.mean : 0;
+                if (varies && baked.kind == ControlKind::kTrilinear) {
+                    value = valueOf(corners_, entries[tables_.size() + k], c);
+                } else if (varies) {
+                    const size_t table = statistics_.size() + c;
+                    value = tables_[table].values[(entries[table] - 1) * 3 + k];
+                }
+                baked.shapes.push_back(value);
+            }
+            baked.items.push_back(item);
+            if (check_ == TRK_CHECK_FULL) {
+                checkItem(item, baked.control(baked.items.size() - 1), at);
+            }
+        }
     }
 
     /// Index of the super-voxel at a place of local space.
@@ -293,31 +390,37 @@ class SidecarReader {
                std::to_string(at[2]) + ")";
     }
 
-    typename GridType::Ptr readGrid(const std::string& name, int shift) {
+    openvdb::GridBase::Ptr readGrid(const std::string& valueType, const std::string& suffix,
+                                    int shift, double offset) {
+        const std::string name = prefix_ + suffix;
         const VdbEntry& entry = findGrid(file_, name);
         const std::string place = file_.path() + ": grid " + name;
-        if (entry.type != TreeType::treeType()) {
-            badSidecar(place, "is of type " + entry.type + "; expected " + TreeType::treeType());
+        if (entry.type != treeTypeName(valueType)) {
+            badSidecar(place,
+                       "is of type " + entry.type + "; expected " + treeTypeName(valueType));
         }
-        auto grid = openvdb::gridPtrCast<GridType>(file_.read(entry));
+        openvdb::GridBase::Ptr grid = file_.read(entry);
         checkFormat(*grid, place);
         if (metaText(*grid, "track_source_digest", place) != hexDigest(header_.digest)) {
             badSidecar(place, "comes from another bake than the file's other grids");
         }
-        const AffineMap expected = superVoxelMap(header_.indexToWorld, 1 << shift);
+        const AffineMap expected = superVoxelMap(header_.indexToWorld, 1 << shift, offset);
         if (!sameMap(expected, affineMap(grid->constTransform(), place))) {
             badSidecar(place, "does not lie over the file's control grid: its transform differs");
         }
-        if (!(grid->background() == 0)) {
-            badSidecar(place, "background is not 0");
-        }
+        grid->apply<DensityGrids>([&](const auto& typed) {
+            using Value = typename std::decay_t<decltype(typed)>::ValueType;
+            if (!(typed.background() == openvdb::zeroVal<Value>())) {
+                badSidecar(place, "background is not 0");
+            }
+        });
         return grid;
     }
 
-    static IntBox supportBox(const TreeType& tree, int shift) {
+    static IntBox supportBox(const openvdb::GridBase& grid, int shift) {
         IntBox box;
-        openvdb::CoordBBox active;
-        if (tree.evalActiveVoxelBoundingBox(active)) {
+        const openvdb::CoordBBox active = grid.evalActiveVoxelBoundingBox();
+        if (!active.empty()) {
             const int64_t size = int64_t{1} << shift;
             Int3 lo = toInt3(active.min());
             Int3 hi = toInt3(active.max());
@@ -331,12 +434,29 @@ class SidecarReader {
     }
 
     /// The active values of a grid, as a table over local space.
-    ScalarTable makeTable(const GridType& grid, int shift, const Int3& anchor) const {
-        ScalarTable result;
-        std::unordered_map<float, SparseTable::Entry> known;
+    ValueTable makeTable(const openvdb::GridBase& grid, int shift, const Int3& anchor,
+                         Values values) const {
+        ValueTable result;
+        result.table = SparseTable(shift, toLocal(supportBox(grid, shift), anchor));
+        grid.apply<DensityGrids>([&](const auto& typed) {
+            fillTable(typed.tree(), grid.getName(), shift, anchor, values, result);
+        });
+        return result;
+    }
+
+    template <class TreeType>
+    void fillTable(const TreeType& tree, const std::string& name, int shift, const Int3& anchor,
+                   Values values, ValueTable& result) const {
+        using Floats = Sample<typename TreeType::ValueType>;
+        const auto hash = [](const Floats& floats) {
+            uint64_t words[2] = {0, 0};
+            std::memcpy(words, floats.data(), sizeof(floats));
+            return hashWords(words, 2, 0);
+        };
+        std::unordered_map<Floats, SparseTable::Entry, decltype(hash)> known(64, hash);
         SparseTable::Entry last = SparseTable::kEmpty;
-        result.table = SparseTable(shift, toLocal(supportBox(grid.tree(), shift), anchor));
-        Regions regions(grid.tree());
+        Floats lastFloats{};
+        TreeRegions<TreeType> regions(tree);
         result.table.fill(
             [&](const Int3& local, int regionShift) -> std::optional<SparseTable::Entry> {
                 const Int3 at = superVoxel(local, shift, anchor);
@@ -347,46 +467,55 @@ class SidecarReader {
                 if (!region->active) {
                     return SparseTable::kEmpty;
                 }
-                const auto value = static_cast<float>(region->value);
-                if (!(value >= 0) || !std::isfinite(value)) {
-                    badSidecar(file_.path(), "grid " + grid.getName() + ": " + where(at) +
-                                                 " is negative, NaN or infinite");
+                const Floats floats = toFloats(region->value);
+                for (const float value : floats) {
+                    if (!std::isfinite(value) || (values == Values::kNotNegative && value < 0)) {
+                        badSidecar(file_.path(), "grid " + name + ": " + where(at) +
+                                                     " is negative, NaN or infinite");
+                    }
                 }
-                if (last == SparseTable::kEmpty || value != result.values[last - 1]) {
-                    const auto [it, isNew] = known.try_emplace(
-                        value, static_cast<SparseTable::Entry>(result.values.size() + 1));
+                if (last == SparseTable::kEmpty || floats != lastFloats) {
+                    const size_t next = result.values.size() / floats.size() + 1;
+                    const auto [it, isNew] =
+                        known.try_emplace(floats, static_cast<SparseTable::Entry>(next));
                     if (isNew) {
-                        result.values.push_back(value);
+                        result.values.insert(result.values.end(), floats.begin(), floats.end());
                     }
                     last = it->second;
+                    lastFloats = floats;
                 }
                 return last;
             },
             [](const Int3&) { return SparseTable::kEmpty; });  // a super-voxel is always uniform
-        return result;
     }
 
-    void checkItem(const BakedSuperVoxel& v, const Int3& at) const {
+    void checkItem(const BakedSuperVoxel& v, const ControlPolynomial<double>& control,
+                   const Int3& at) const {
         const double slack = 1 + 1e-6;
-        const double control = static_cast<double>(v.control);
-        const double needed =
-            std::max(control - static_cast<double>(v.min), static_cast<double>(v.max) - control);
+        const auto min = static_cast<double>(v.min);
+        const auto max = static_cast<double>(v.max);
+        const auto mean = static_cast<double>(v.mean);
+        // A control may reach beyond the density by its majorant; a constant one is the mean, whose
+        // majorant must reach both bounds.
+        const double majorant = static_cast<double>(v.majorant) * slack;
+        const bool constant = header_.controlKind == ControlKind::kConstant;
         const char* wrong = nullptr;
         if (v.rms > 0 && v.majorant == 0) {
             wrong = "majorant 0 with an RMS above 0";
-        } else if (v.min > v.max || v.control * slack < static_cast<double>(v.min) ||
-                   control > static_cast<double>(v.max) * slack) {
-            wrong = "a control that is not between min and max";
-        } else if (static_cast<double>(v.majorant) * slack < needed) {
+        } else if (v.min > v.max || mean * slack < min || mean > max * slack) {
+            wrong = constant ? "a control that is not between min and max"
+                             : "a mean that is not between min and max";
+        } else if ((constant && majorant < std::max(mean - min, max - mean)) ||
+                   control.max() > (max + majorant) * slack) {
             wrong = "a majorant that does not bound the residual";
-        } else if (static_cast<double>(v.rms) > static_cast<double>(v.majorant) * slack) {
+        } else if (static_cast<double>(v.rms) > majorant) {
             wrong = "an RMS above its majorant";
         }
         if (wrong) {
             char text[160];
-            std::snprintf(text, sizeof(text), " (control %g, majorant %g, rms %g, min %g, max %g)",
-                          control, static_cast<double>(v.majorant), static_cast<double>(v.rms),
-                          static_cast<double>(v.min), static_cast<double>(v.max));
+            std::snprintf(text, sizeof(text), " (%s %g, majorant %g, rms %g, min %g, max %g)",
+                          constant ? "control" : "mean", mean, static_cast<double>(v.majorant),
+                          static_cast<double>(v.rms), min, max);
             badSidecar(file_.path(), where(at) + " has " + wrong + text);
         }
     }
@@ -394,7 +523,13 @@ class SidecarReader {
     VdbFile& file_;
     const SidecarHeader& header_;
     TrkCheck check_;
-    IntBox box_;  // index space
+    std::string prefix_;
+    size_t channels_;
+    std::vector<Statistic> statistics_;
+    int shift_ = 0;
+    IntBox box_;                      // index space
+    std::vector<ValueTable> tables_;  // of statistics, then of gradients
+    ValueTable corners_;
 };
 
 }  // namespace
@@ -419,11 +554,7 @@ Sidecar readSidecar(const std::string& path, const DensitySummary* density, TrkC
         checkAgainst(sidecar.header, *density, check, path);
     }
     const Int3* anchor = density ? &density->anchor : nullptr;
-    if (sidecar.header.valueType == "double") {
-        SidecarReader<openvdb::DoubleTree>(file, sidecar.header, check).read(anchor, sidecar);
-    } else {
-        SidecarReader<openvdb::FloatTree>(file, sidecar.header, check).read(anchor, sidecar);
-    }
+    SidecarReader(file, sidecar.header, check).read(anchor, sidecar);
     return sidecar;
 }
 

@@ -11,6 +11,7 @@
 #include <cstdint>
 #include <cstdio>
 #include <string>
+#include <vector>
 
 namespace trk::schema {
 
@@ -18,16 +19,40 @@ constexpr int kFormatMajor = 1;
 constexpr const char* kFormat = "1.0";
 constexpr const char* kInterpolation = "trilinear";
 
-/// The grids of statistics, in the order written, and where their values live.
+constexpr const char* kControlSuffix = "_control";
+
+/// A grid of statistics, and where its values live.
 struct Statistic {
     const char* suffix;
     float BakedSuperVoxel::*value;
 };
-constexpr Statistic kStatistics[] = {
-    {"_control", &BakedSuperVoxel::control}, {"_majorant", &BakedSuperVoxel::majorant},
-    {"_rms", &BakedSuperVoxel::rms},         {"_min", &BakedSuperVoxel::min},
-    {"_max", &BakedSuperVoxel::max},
-};
+
+/// The grids of statistics of a kind of control, in the order written. The mean is the control,
+/// except where that is trilinear: then G_control holds corner values, and is no statistic.
+inline std::vector<Statistic> statistics(ControlKind kind) {
+    const bool trilinear = kind == ControlKind::kTrilinear;
+    std::vector<Statistic> list{{trilinear ? "_mean" : kControlSuffix, &BakedSuperVoxel::mean},
+                                {"_majorant", &BakedSuperVoxel::majorant},
+                                {"_rms", &BakedSuperVoxel::rms},
+                                {"_min", &BakedSuperVoxel::min},
+                                {"_max", &BakedSuperVoxel::max}};
+    if (kind != ControlKind::kConstant) {
+        list.push_back({"_deviation", &BakedSuperVoxel::deviation});
+    }
+    return list;
+}
+
+/// The grids of an affine control's gradients: one a channel of the source.
+inline std::vector<std::string> gradientSuffixes(size_t channels) {
+    const std::string name = "_control_gradient";
+    return channels == 1 ? std::vector<std::string>{name}
+                         : std::vector<std::string>{name + "_r", name + "_g", name + "_b"};
+}
+
+/// The type of vectors of the components of `valueType`.
+inline std::string vectorType(const std::string& valueType) {
+    return valueType == "double" || valueType == "vec3d" ? "vec3d" : "vec3s";
+}
 
 inline std::string gridPrefix(const std::string& source) {
     return source.empty() ? "density" : source;
@@ -43,11 +68,15 @@ inline std::string hexDigest(uint64_t digest) {
     return text;
 }
 
-/// Index i of a grid of super-voxels of `size` lies at source index size i + size / 2.
-inline AffineMap superVoxelMap(const AffineMap& source, int size) {
+/// Where index i of a grid of super-voxels of `size` lies in source index space: size i + offset.
+/// Values of super-voxels lie at their centres, those of corners at the corners.
+inline double centreOffset(int size) {
+    return size / 2.0;
+}
+
+inline AffineMap superVoxelMap(const AffineMap& source, int size, double offset) {
     AffineMap map = source;
-    const double centre = size / 2.0;
-    const Vec3d shift = source.vector({{centre, centre, centre}});
+    const Vec3d shift = source.vector({{offset, offset, offset}});
     for (int row = 0; row < 3; ++row) {
         for (int column = 0; column < 3; ++column) {
             map.linear[row][column] *= size;
@@ -57,15 +86,14 @@ inline AffineMap superVoxelMap(const AffineMap& source, int size) {
     return map;
 }
 
-inline AffineMap sourceMap(const AffineMap& superVoxels, int size) {
+inline AffineMap sourceMap(const AffineMap& superVoxels, int size, double offset) {
     AffineMap map = superVoxels;
     for (auto& row : map.linear) {
         for (double& value : row) {
             value /= size;
         }
     }
-    const double centre = size / 2.0;
-    const Vec3d shift = map.vector({{centre, centre, centre}});
+    const Vec3d shift = map.vector({{offset, offset, offset}});
     for (int row = 0; row < 3; ++row) {
         map.translation[row] -= shift[row];
     }

@@ -1,4 +1,5 @@
 // SPDX-License-Identifier: Apache-2.0
+#include "density_types.h"
 #include "sidecar.h"
 #include "sidecar_schema.h"
 #include "vdb_file.h"
@@ -7,6 +8,8 @@
 #include <openvdb/tools/Prune.h>
 
 #include <functional>
+#include <string>
+#include <vector>
 
 namespace trk {
 
@@ -28,7 +31,7 @@ void addMetadata(openvdb::GridBase& grid, const SidecarHeader& header) {
     number("track_source_index", header.source.index);
     text("track_source_digest", hexDigest(header.digest));
     number("track_super_voxel_size", header.superVoxelSize);
-    text("track_control", header.controlKind);
+    text("track_control", controlName(header.controlKind));
     text("track_interpolation", kInterpolation);
     number("track_levels", header.levels);
     if (header.repair & TRK_REPAIR_DROP_NONFINITE) {
@@ -41,58 +44,128 @@ void addMetadata(openvdb::GridBase& grid, const SidecarHeader& header) {
     }
 }
 
+/// The values of an item of a table, as many as the grid's values have channels.
+using ValuesOf = std::function<const float*(size_t item)>;
+
+/// Index of an item's place in a grid of super-voxels.
+Int3 gridIndex(const Int3& local, const Int3& anchor, int itemShift) {
+    return {{(anchor[0] + local[0]) >> itemShift, (anchor[1] + local[1]) >> itemShift,
+             (anchor[2] + local[2]) >> itemShift}};
+}
+
+/// Sets the value of every occupied item and tile, active.
 template <class GridType>
-openvdb::GridBase::Ptr makeGrid(const SparseTable& table, const Int3& anchor,
-                                const std::function<float(size_t)>& valueOf) {
+void fillItems(GridType& grid, const SparseTable& table, const Int3& anchor,
+               const ValuesOf& valuesOf) {
     using Value = typename GridType::ValueType;
-    auto grid = GridType::create();
-    auto accessor = grid->getAccessor();
+    auto accessor = grid.getAccessor();
     const int itemShift = table.itemShift();
     table.forEach([&](const Int3& lo, int shift, SparseTable::Entry entry) {
-        Int3 at;
-        for (size_t a = 0; a < 3; ++a) {
-            at[a] = (anchor[a] + lo[a]) >> itemShift;
-        }
-        const auto value = static_cast<Value>(valueOf(entry - 1));
+        const openvdb::Coord at = toCoord(gridIndex(lo, anchor, itemShift));
+        const auto value = fromFloats<Value>(valuesOf(SparseTable::index(entry)));
         if (shift == itemShift) {
-            accessor.setValueOn(toCoord(at), value);
+            accessor.setValueOn(at, value);
             return;
         }
         const int32_t size = 1 << (shift - itemShift);
-        grid->sparseFill(openvdb::CoordBBox::createCube(toCoord(at), size), value, true);
+        grid.sparseFill(openvdb::CoordBBox::createCube(at, size), value, true);
     });
-    openvdb::tools::prune(grid->tree());
-    return grid;
 }
 
-openvdb::GridBase::Ptr makeGrid(const SidecarHeader& header, const SparseTable& table,
-                                const Int3& anchor, const std::string& suffix,
-                                const std::function<float(size_t)>& valueOf) {
-    openvdb::GridBase::Ptr grid = header.valueType == "double"
-                                      ? makeGrid<openvdb::DoubleGrid>(table, anchor, valueOf)
-                                      : makeGrid<openvdb::FloatGrid>(table, anchor, valueOf);
-    grid->setName(gridPrefix(header.source.name) + suffix);
-    grid->setGridClass(openvdb::GRID_FOG_VOLUME);
-    grid->setTransform(makeTransform(superVoxelMap(header.indexToWorld, 1 << table.itemShift())));
-    addMetadata(*grid, header);
-    return grid;
+/// Sets the corner values of every occupied item and tile that are not 0; neighbours agree.
+template <class GridType>
+void fillCorners(GridType& grid, const BakedVolume& baked, const Int3& anchor) {
+    using Value = typename GridType::ValueType;
+    auto accessor = grid.getAccessor();
+    const int itemShift = baked.table.itemShift();
+    baked.table.forEach([&](const Int3& lo, int shift, SparseTable::Entry entry) {
+        const openvdb::Coord at = toCoord(gridIndex(lo, anchor, itemShift));
+        const size_t item = SparseTable::index(entry) * baked.channels;
+        for (size_t corner = 0; corner < 8; ++corner) {
+            float floats[3];
+            for (size_t c = 0; c < baked.channels; ++c) {
+                floats[c] = baked.shape(item + c)[corner];
+            }
+            const auto value = fromFloats<Value>(floats);
+            if (shift > itemShift) {  // homogeneous: every corner has this value
+                const int32_t size = 1 << (shift - itemShift);
+                grid.sparseFill(openvdb::CoordBBox::createCube(at, size + 1), value, true);
+                break;
+            }
+            if (!(value == openvdb::zeroVal<Value>())) {
+                accessor.setValueOn(at.offsetBy(static_cast<int>(corner >> 2),
+                                                static_cast<int>(corner >> 1 & 1),
+                                                static_cast<int>(corner & 1)),
+                                    value);
+            }
+        }
+    });
 }
+
+/// What all grids of one sidecar share.
+struct SidecarGrids {
+    const SidecarHeader& header;
+    const Int3& anchor;
+
+    /// A grid of super-voxels of `size`, filled by `fill(typed grid)`.
+    template <class Fill>
+    openvdb::GridBase::Ptr make(const std::string& valueType, const std::string& suffix, int size,
+                                double offset, const Fill& fill) const {
+        openvdb::GridBase::Ptr grid = openvdb::GridBase::createGrid(treeTypeName(valueType));
+        grid->apply<DensityGrids>([&](auto& typed) {
+            fill(typed);
+            openvdb::tools::prune(typed.tree());
+        });
+        grid->setName(gridPrefix(header.source.name) + suffix);
+        grid->setGridClass(openvdb::GRID_FOG_VOLUME);
+        grid->setTransform(makeTransform(superVoxelMap(header.indexToWorld, size, offset)));
+        addMetadata(*grid, header);
+        return grid;
+    }
+    /// A grid of values per super-voxel.
+    openvdb::GridBase::Ptr makeItems(const std::string& valueType, const std::string& suffix,
+                                     const SparseTable& table, const ValuesOf& valuesOf) const {
+        const int size = 1 << table.itemShift();
+        return make(valueType, suffix, size, centreOffset(size),
+                    [&](auto& grid) { fillItems(grid, table, anchor, valuesOf); });
+    }
+};
 
 }  // namespace
 
 void writeSidecar(const OutputFile& file, const SidecarHeader& header, const BakedVolume& baked,
                   const Int3& anchor) {
     openvdb::initialize();
-    const auto levels = static_cast<int32_t>(baked.levels.size());
-    VdbWriter writer(file, static_cast<int32_t>(std::size(kStatistics)) + levels);
-    for (const Statistic& statistic : kStatistics) {
-        writer.add(makeGrid(header, baked.table, anchor, statistic.suffix,
-                            [&](size_t i) { return baked.items[i].*statistic.value; }));
+    const size_t channels = baked.channels;
+    const std::vector<Statistic> list = statistics(baked.kind);
+    const std::vector<std::string> gradients =
+        baked.kind == ControlKind::kAffine ? gradientSuffixes(channels) : std::vector<std::string>();
+    const size_t corners = baked.kind == ControlKind::kTrilinear ? 1 : 0;
+    VdbWriter writer(file, static_cast<int32_t>(list.size() + gradients.size() + corners +
+                                                baked.levels.size()));
+    const SidecarGrids grids{header, anchor};
+    if (corners > 0) {
+        writer.add(grids.make(header.valueType, kControlSuffix, baked.superVoxelSize(), 0,
+                              [&](auto& grid) { fillCorners(grid, baked, anchor); }));
     }
-    for (int32_t level = 1; level <= levels; ++level) {
-        const ScalarTable& means = baked.levels[static_cast<size_t>(level) - 1];
-        writer.add(makeGrid(header, means.table, anchor, levelSuffix(level),
-                            [&](size_t i) { return means.values[i]; }));
+    std::vector<float> values(channels);
+    for (const Statistic& statistic : list) {
+        writer.add(grids.makeItems(header.valueType, statistic.suffix, baked.table, [&](size_t i) {
+            for (size_t c = 0; c < channels; ++c) {
+                values[c] = baked.items[i * channels + c].*statistic.value;
+            }
+            return values.data();
+        }));
+    }
+    for (size_t c = 0; c < gradients.size(); ++c) {
+        writer.add(grids.makeItems(vectorType(header.valueType), gradients[c], baked.table,
+                                   [&](size_t i) { return baked.shape(i * channels + c); }));
+    }
+    for (size_t level = 1; level <= baked.levels.size(); ++level) {
+        const ValueTable& means = baked.levels[level - 1];
+        writer.add(grids.makeItems(header.valueType, levelSuffix(static_cast<int>(level)),
+                                   means.table,
+                                   [&](size_t i) { return &means.values[i * channels]; }));
     }
     writer.finish();
 }

@@ -2,6 +2,7 @@
 #include "vdb_file.h"
 
 #include "../error.h"
+#include "density_types.h"
 #include "guarded_stream.h"
 
 #include <openvdb/io/Archive.h>
@@ -149,8 +150,8 @@ class VdbFile::Archive : public openvdb::io::Archive {
             return grid;
         }
         grid->readTopology(stream_);
-        const uint64_t valueSize = entry.type.find("double") != std::string::npos ? 8 : 4;
-        const uint64_t leafBytes = grid->constBaseTree().leafCount() * 512 * valueSize;
+        const uint64_t leafBytes =
+            grid->constBaseTree().leafCount() * 512 * valueBytes(valueTypeName(entry.type));
         if (maxBytes > 0 && leafBytes > maxBytes) {
             throw Error(
                 TRK_ERROR_OUT_OF_MEMORY,
@@ -231,21 +232,20 @@ class VdbFile::Archive : public openvdb::io::Archive {
     /// Has the stream watch over the chunks of a grid, where it knows what they look like.
     void guard(const VdbEntry& entry) {
         using Codec = GuardedFileBuf::Codec;
-        const bool isFloat = entry.type == openvdb::FloatTree::treeType();
-        const bool isDouble = entry.type == openvdb::DoubleTree::treeType();
+        const std::string valueType = valueTypeName(entry.type);
+        const auto channels = static_cast<size_t>(channelCount(valueType));
         const uint32_t flags = openvdb::io::getDataCompression(stream_);
         Codec codec = flags & openvdb::io::COMPRESS_BLOSC ? Codec::kBlosc
                       : flags & openvdb::io::COMPRESS_ZIP ? Codec::kZip
                                                           : Codec::kUnguarded;
-        if (fileVersion() < openvdb::OPENVDB_FILE_VERSION_NODE_MASK_COMPRESSION ||
-            !(isFloat || isDouble)) {
+        if (fileVersion() < openvdb::OPENVDB_FILE_VERSION_NODE_MASK_COMPRESSION || channels == 0) {
             codec = Codec::kUnguarded;
         }
-        buffer_.beginGrid(codec,
-                          entry.half ? 2
-                          : isFloat  ? sizeof(float)
-                                     : sizeof(double),
-                          (flags & openvdb::io::COMPRESS_ACTIVE_MASK) != 0);
+        GuardedFileBuf::Values values;
+        values.half = entry.half;
+        values.size = entry.half ? 2 * channels : valueBytes(valueType);
+        values.mayBeEightBytes = valueType == "double";
+        buffer_.beginGrid(codec, values, (flags & openvdb::io::COMPRESS_ACTIVE_MASK) != 0);
     }
 
     GuardedFileBuf buffer_;

@@ -1,0 +1,65 @@
+// SPDX-License-Identifier: Apache-2.0
+// From what a volume is to code made for it: channels and kind of control at compile time, so that
+// a grey volume with a constant control pays for neither.
+#pragma once
+
+#include "super_voxels.h"
+#include "volume.h"
+
+#include <array>
+#include <cstddef>
+#include <cstdint>
+#include <type_traits>
+
+namespace trk {
+
+/// What a query is made for at compile time: a density of F channels, an extinction of C, a control
+/// of kind K.
+template <size_t F, size_t C, ControlKind K>
+struct Variant {
+    static constexpr size_t kChannels = C;
+    using Extinction = VolumeExtinction<F, C>;
+
+    /// The volume's super-voxels as estimators walk them.
+    struct Walk {
+        const SuperVoxels& superVoxels;
+
+        template <class Visit>
+        void walk(const LocalRay& ray, double t0, double t1, Visit&& visit) const {
+            superVoxels.walk<C, K>(ray, t0, t1, visit);
+        }
+    };
+    static std::array<double, C> integrateControl(const SuperVoxels& superVoxels,
+                                                  const LocalRay& ray, size_t level,
+                                                  uint64_t& regions) {
+        return superVoxels.integrateControl<C, K>(ray, level, regions);
+    }
+};
+
+/// Calls body(Variant) for what the volume is. Ratio tracking never looks at a control's slope.
+template <class Body>
+void withVariant(const Volume& volume, bool controlMatters, const Body& body) {
+    const auto withKind = [&](auto f, auto c) {
+        constexpr size_t F = decltype(f)::value;
+        constexpr size_t C = decltype(c)::value;
+        switch (controlMatters ? volume.superVoxels.kind() : ControlKind::kConstant) {
+            case ControlKind::kConstant:
+                return body(Variant<F, C, ControlKind::kConstant>());
+            case ControlKind::kTrilinear:
+                return body(Variant<F, C, ControlKind::kTrilinear>());
+            case ControlKind::kAffine:
+                return body(Variant<F, C, ControlKind::kAffine>());
+        }
+    };
+    constexpr std::integral_constant<size_t, 1> kOne;
+    constexpr std::integral_constant<size_t, 3> kThree;
+    if (volume.channels() == 1) {
+        withKind(kOne, kOne);
+    } else if (volume.hasDensity && volume.field.channels() == 1) {
+        withKind(kOne, kThree);
+    } else {
+        withKind(kThree, kThree);
+    }
+}
+
+}  // namespace trk

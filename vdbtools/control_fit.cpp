@@ -1,0 +1,214 @@
+// SPDX-License-Identifier: Apache-2.0
+#include "control_fit.h"
+
+#include "hash.h"
+
+#include <tbb/blocked_range.h>
+#include <tbb/parallel_for.h>
+
+#include <algorithm>
+#include <cmath>
+#include <utility>
+
+namespace vdbtools {
+
+using trk::Int3;
+
+std::array<float, 3> fitGradient(const CornerMoments& moments, double mean, int size) {
+    const double n = size;
+    // Mean over the vertices of (x - centre)^2, the trapezoid rule of its integral.
+    const double spread = n * n / 12 + 1.0 / 6;
+    std::array<double, 3> gradient{};
+    for (size_t axis = 0; axis < 3; ++axis) {
+        double difference = 0;
+        for (size_t corner = 0; corner < 8; ++corner) {
+            difference += (corner >> (2 - axis) & 1 ? 1 : -1) * moments[corner];
+        }
+        gradient[axis] = 0.5 * n * difference / spread;
+    }
+    // Least squares are isotropic in the gradient, and the control is >= 0 where
+    // |gx| + |gy| + |gz| <= mean / (n / 2): the nearest such gradient has all components shortened
+    // by the same amount [Duchi et al. 2008].
+    std::array<double, 3> sizes{
+        {std::fabs(gradient[0]), std::fabs(gradient[1]), std::fabs(gradient[2])}};
+    std::sort(sizes.begin(), sizes.end(), std::greater<>());
+    double shorten = 0;
+    double sum = 0;
+    for (size_t i = 0; i < 3; ++i) {
+        sum += sizes[i];
+        const double candidate = (sum - 2 * mean / n) / static_cast<double>(i + 1);
+        if (candidate < sizes[i]) {
+            shorten = std::max(candidate, 0.0);
+        }
+    }
+    std::array<float, 3> result{};
+    for (size_t axis = 0; axis < 3; ++axis) {
+        const double length = std::max(std::fabs(gradient[axis]) - shorten, 0.0);
+        // Rounded towards 0, lest rounding makes a corner negative.
+        auto g = static_cast<float>(length);
+        g = static_cast<double>(g) > length ? std::nextafter(g, 0.0f) : g;
+        result[axis] = gradient[axis] < 0 ? -g : g;
+    }
+    return result;
+}
+
+size_t CornerFit::Hash::operator()(const Int3& p) const {
+    return trk::hashWords(p.data(), p.size(), 0);
+}
+
+CornerFit::CornerFit(const std::vector<Cell>& cells, const std::vector<Fixed>& fixed, int size)
+    : size_(size) {
+    for (int i = 0; i <= size; ++i) {
+        const double hat = static_cast<double>(i) / size;
+        const double weight = i == 0 || i == size ? 0.5 : 1;
+        diagonal_ += weight * hat * hat / size;
+        coupling_ += weight * hat * (1 - hat) / size;
+    }
+    std::unordered_map<Int3, uint32_t, Hash> ids;
+    cornersOf_.reserve(cells.size());
+    for (const Cell& cell : cells) {
+        std::array<uint32_t, 8> corners{};
+        for (size_t k = 0; k < 8; ++k) {
+            const auto bit = [k](int shift) { return static_cast<int64_t>(k >> shift & 1); };
+            const Int3 at{{cell.at[0] + bit(2), cell.at[1] + bit(1), cell.at[2] + bit(0)}};
+            corners[k] = ids.try_emplace(at, static_cast<uint32_t>(ids.size())).first->second;
+        }
+        const auto parity = static_cast<size_t>((cell.at[0] & 1) << 2 | (cell.at[1] & 1) << 1 |
+                                                (cell.at[2] & 1));
+        independent_[parity].push_back(static_cast<uint32_t>(cornersOf_.size()));
+        cornersOf_.push_back(corners);
+    }
+    values_.assign(ids.size(), 0);
+    free_.assign(ids.size(), 1);
+    for (const Fixed& f : fixed) {
+        const auto it = ids.find(f.corner);
+        if (it != ids.end()) {
+            values_[it->second] = static_cast<double>(f.value);
+            free_[it->second] = 0;
+        }
+    }
+    fit(cells);
+}
+
+std::array<float, 8> CornerFit::corners(size_t i) const {
+    std::array<float, 8> result{};
+    for (size_t k = 0; k < 8; ++k) {
+        result[k] = static_cast<float>(values_[cornersOf_[i][k]]);
+    }
+    return result;
+}
+
+/// The Gram matrix of all corners' hat functions times x: in each cell, a product of three
+/// one-dimensional ones.
+void CornerFit::multiply(const std::vector<double>& x, std::vector<double>& result) const {
+    std::fill(result.begin(), result.end(), 0.0);
+    for (const std::vector<uint32_t>& cells : independent_) {
+        tbb::parallel_for(
+            tbb::blocked_range<size_t>(0, cells.size(), 1024),
+            [&](const tbb::blocked_range<size_t>& range) {
+                for (size_t i = range.begin(); i != range.end(); ++i) {
+                    const std::array<uint32_t, 8>& corners = cornersOf_[cells[i]];
+                    double v[8];
+                    for (size_t k = 0; k < 8; ++k) {
+                        v[k] = x[corners[k]];
+                    }
+                    for (const size_t stride : {4u, 2u, 1u}) {
+                        for (size_t k = 0; k < 8; ++k) {
+                            if ((k & stride) == 0) {
+                                const double a = v[k];
+                                const double b = v[k + stride];
+                                v[k] = diagonal_ * a + coupling_ * b;
+                                v[k + stride] = coupling_ * a + diagonal_ * b;
+                            }
+                        }
+                    }
+                    for (size_t k = 0; k < 8; ++k) {
+                        result[corners[k]] += v[k];
+                    }
+                }
+            });
+    }
+}
+
+/// Conjugate gradients on the free corners, from x on; the condition number is about 27.
+void CornerFit::solve(const std::vector<double>& right, std::vector<double>& x) const {
+    constexpr int kMaxSteps = 200;
+    constexpr double kTolerance = 1e-13;
+    const size_t n = x.size();
+    const auto dot = [&](const std::vector<double>& a, const std::vector<double>& b) {
+        double sum = 0;
+        for (size_t i = 0; i < n; ++i) {
+            sum += free_[i] ? a[i] * b[i] : 0;
+        }
+        return sum;
+    };
+    std::vector<double> product(n);
+    std::vector<double> residual(n);
+    multiply(x, product);
+    for (size_t i = 0; i < n; ++i) {
+        residual[i] = free_[i] ? right[i] - product[i] : 0;
+    }
+    std::vector<double> direction = residual;
+    double squares = dot(residual, residual);
+    const double goal = kTolerance * kTolerance * dot(right, right);
+    for (int step = 0; step < kMaxSteps && squares > goal; ++step) {
+        multiply(direction, product);
+        const double length = squares / dot(direction, product);
+        for (size_t i = 0; i < n; ++i) {
+            if (free_[i]) {
+                x[i] += length * direction[i];
+                residual[i] -= length * product[i];
+            }
+        }
+        const double next = dot(residual, residual);
+        const double keep = next / squares;
+        squares = next;
+        for (size_t i = 0; i < n; ++i) {
+            direction[i] = free_[i] ? residual[i] + keep * direction[i] : 0;
+        }
+    }
+}
+
+void CornerFit::fit(const std::vector<Cell>& cells) {
+    const size_t n = values_.size();
+    std::vector<double> right(n, 0);
+    std::vector<double> share(n, 0);  // of a super-voxel's mass, per density at the corner
+    double mass = 0;
+    for (size_t i = 0; i < cells.size(); ++i) {
+        for (size_t k = 0; k < 8; ++k) {
+            right[cornersOf_[i][k]] += (*cells[i].moments)[k];
+            share[cornersOf_[i][k]] += 0.125;
+            mass += (*cells[i].moments)[k];
+        }
+    }
+    // Corners that least squares would make negative are held at 0, and the others fitted again.
+    constexpr int kMaxRounds = 12;
+    std::vector<double> perMass(n, 0);
+    for (int round = 0; round < kMaxRounds; ++round) {
+        solve(right, values_);
+        solve(share, perMass);
+        double fitted = 0;
+        double response = 0;
+        for (size_t i = 0; i < n; ++i) {
+            fitted += share[i] * values_[i];
+            response += free_[i] ? share[i] * perMass[i] : 0;
+        }
+        const double multiplier = response > 0 ? (mass - fitted) / response : 0;
+        bool negative = false;
+        for (size_t i = 0; i < n; ++i) {
+            if (free_[i]) {
+                values_[i] += multiplier * perMass[i];
+                if (values_[i] < 0) {
+                    values_[i] = perMass[i] = 0;
+                    free_[i] = 0;
+                    negative = true;
+                }
+            }
+        }
+        if (!negative) {
+            break;
+        }
+    }
+}
+
+}  // namespace vdbtools

@@ -1,0 +1,63 @@
+// SPDX-License-Identifier: Apache-2.0
+// Least-squares fits of a control to the density: gradients super-voxel by super-voxel, corner
+// values over all of them together.
+#pragma once
+
+#include "math.h"
+
+#include <array>
+#include <cstddef>
+#include <cstdint>
+#include <unordered_map>
+#include <vector>
+
+namespace vdbtools {
+
+/// Sums over a super-voxel's vertices of weight x density x the hat function of each corner (x
+/// slowest), over its number of cells. They add up to the mean, and say all of the density that a
+/// fit of a multilinear control asks.
+using CornerMoments = std::array<double, 8>;
+
+/// The gradient (density per voxel) that leaves the least squared residual around the mean, among
+/// those with which the control is >= 0 everywhere in a super-voxel of `size` voxels.
+std::array<float, 3> fitGradient(const CornerMoments& moments, double mean, int size);
+
+/// Corner values of a continuous control over many super-voxels, >= 0, with the least squared
+/// residual that keeps the density's mass.
+class CornerFit {
+  public:
+    struct Cell {
+        trk::Int3 at;  ///< in super-voxels
+        const CornerMoments* moments;
+    };
+    struct Fixed {
+        trk::Int3 corner;
+        float value;
+    };
+
+    /// `fixed`: corners of the cells whose values are given; the others are fitted, in parallel,
+    /// with the same bits for any number of threads. `size`: of the super-voxels, in voxels.
+    CornerFit(const std::vector<Cell>& cells, const std::vector<Fixed>& fixed, int size);
+
+    /// The values at the corners of cell `i`, x slowest.
+    std::array<float, 8> corners(size_t i) const;
+
+  private:
+    struct Hash {
+        size_t operator()(const trk::Int3& p) const;
+    };
+
+    void multiply(const std::vector<double>& x, std::vector<double>& result) const;
+    void solve(const std::vector<double>& right, std::vector<double>& x) const;
+    void fit(const std::vector<Cell>& cells);
+
+    int size_;
+    std::vector<std::array<uint32_t, 8>> cornersOf_;     // of each cell
+    std::array<std::vector<uint32_t>, 8> independent_;   // cells of which no two share a corner
+    std::vector<double> values_;                         // of each corner
+    std::vector<char> free_;                             // whether its value is to be found
+    double diagonal_ = 0;  // of the one-dimensional Gram matrix of the two hat functions,
+    double coupling_ = 0;  // and beside it
+};
+
+}  // namespace vdbtools

@@ -71,8 +71,8 @@ struct SuperVoxel {
 template <size_t C, ControlKind K>
 class SuperVoxelView {
   public:
-    SuperVoxelView(const SuperVoxel* items, const float* shapes, const Int3& lo, double size)
-        : items_(items), shapes_(shapes), lo_(lo), inverseSize_(1 / size) {}
+    SuperVoxelView(const SuperVoxel* items, const float* shapes, const Int3& lo, double inverseSize)
+        : items_(items), shapes_(shapes), lo_(lo), inverseSize_(inverseSize) {}
 
     const SuperVoxel& operator[](size_t channel) const { return items_[channel]; }
 
@@ -168,14 +168,14 @@ class SuperVoxels {
     /// without a point is asked.
     template <size_t C, ControlKind K, class Visit>
     void walk(const LocalRay& ray, double t0, double t1, Visit&& visit) const {
-        const double superVoxelSize = size();
+        const double inverseSize = 1.0 / size();
         table_.walk(ray, t0, t1,
                     [&](SparseTable::Entry entry, const Int3& lo, int, double tEnter,
                         double tExit) {
                         const size_t item = SparseTable::index(entry) * C;
                         using View = SuperVoxelView<C, K>;
                         return visit(View(&items_[item], shapes_.data() + item * View::kStride, lo,
-                                          superVoxelSize),
+                                          inverseSize),
                                      tEnter, tExit);
                     });
     }

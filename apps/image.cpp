@@ -67,13 +67,14 @@ void writeExr(const Image& image, const std::map<std::string, std::string>& attr
     }
 }
 
-void writePng(const Image& image, const trk::OutputFile& file) {
+void writePng(const Image& image, Tone tone, const trk::OutputFile& file) {
     std::vector<uint8_t> bytes(image.pixelCount() * 3);
     const char* const names[] = {"R", "G", "B"};
     for (size_t c = 0; c < 3; ++c) {
         const std::vector<float>& channel = image.channels.at(names[c]);
         for (size_t i = 0; i < channel.size(); ++i) {
-            bytes[3 * i + c] = encodeSrgb(toneMap(channel[i]));
+            const float value = tone == Tone::kRolledOff ? toneMap(channel[i]) : channel[i];
+            bytes[3 * i + c] = encodeSrgb(value);
         }
     }
     png_image png;

@@ -28,8 +28,10 @@ struct Image {
 void writeExr(const Image& image, const std::map<std::string, std::string>& attributes,
               const trk::OutputFile& file);
 
-/// Writes channels R, G, B tone-mapped: the highlights rolled off, sRGB encoded, 8 bit. Does not
-/// commit. Throws trk::Error.
-void writePng(const Image& image, const trk::OutputFile& file);
+/// How a PNG shows linear values: as they are, or with the highlights rolled off.
+enum class Tone { kLinear, kRolledOff };
+
+/// Writes channels R, G, B, sRGB encoded, 8 bit. Does not commit. Throws trk::Error.
+void writePng(const Image& image, Tone tone, const trk::OutputFile& file);
 
 }  // namespace apps

@@ -1,102 +1,54 @@
 // SPDX-License-Identifier: Apache-2.0
-// vdbtrack preview: a picture from a sidecar alone.
+// vdbtrack preview: pictures from a sidecar alone.
 #include "command_line.h"
 
+#include "camera.h"
 #include "error.h"
 #include "image.h"
 #include "io/output_file.h"
-#include "math.h"
+#include "lit_preview.h"
 #include "track/track.hpp"
 
 #include <algorithm>
+#include <array>
 #include <cmath>
 #include <cstdio>
 #include <filesystem>
 #include <iostream>
-#include <limits>
+#include <memory>
 #include <sstream>
+#include <tuple>
+#include <utility>
 
 namespace apps {
 namespace {
 
 namespace po = boost::program_options;
 using trk::Vec3d;
+using vdbtools::Camera;
 
-const std::vector<std::string> kViews{"front", "side", "top", "iso"};
+constexpr double kPi = 3.14159265358979323846;
+constexpr int kMaxFrames = 9999;
 
-struct Camera {
-    Vec3d eye;
-    Vec3d right;  // of unit length, like the other two
-    Vec3d up;
-    Vec3d forward;
-    double tangent = 0.3;  // of half the vertical field of view
+/// What to draw, from the command line.
+struct Shot {
+    std::string sidecar;
+    std::string output;
+    int width = 0;
+    int height = 0;
+    int frames = 0;  // 0: one picture, not numbered
+    uint32_t level = 0;
+    double scale = 0;
+    std::array<float, 3> color{};
+    bool lit = true;
+    Camera camera;  // of the first frame
+    Vec3d centre;   // that a turntable turns around
+
+    double aspect() const { return static_cast<double>(width) / height; }
+    Camera cameraOf(int frame) const {
+        return frame == 0 ? camera : camera.orbited(centre, 2 * kPi * frame / frames);
+    }
 };
-
-Vec3d normalized(const Vec3d& v) {
-    return (1 / length(v)) * v;
-}
-
-Camera look(const Vec3d& forward, const Vec3d& roughlyUp) {
-    Camera camera;
-    camera.forward = normalized(forward);
-    camera.right = normalized(cross(camera.forward, roughlyUp));
-    camera.up = cross(camera.right, camera.forward);
-    return camera;
-}
-
-/// y is up: front looks along -z, side along -x, top along -y.
-Camera standardView(const std::string& view) {
-    const Vec3d y{{0, 1, 0}};
-    if (view == "front") {
-        return look({{0, 0, -1}}, y);
-    }
-    if (view == "side") {
-        return look({{-1, 0, 0}}, y);
-    }
-    if (view == "top") {
-        return look({{0, -1, 0}}, {{0, 0, -1}});
-    }
-    return look({{-1, -0.62, -1}}, y);
-}
-
-/// Moves the camera back until the whole box is in the picture, with a margin.
-void frame(Camera& camera, const TrkVolumeInfo& info, double aspect) {
-    Vec3d centre;
-    Vec3d half;
-    for (int a = 0; a < 3; ++a) {
-        centre[a] = 0.5 * (info.boundsMin[a] + info.boundsMax[a]);
-        half[a] = 0.5 * (info.boundsMax[a] - info.boundsMin[a]);
-    }
-    constexpr double kMargin = 1.06;
-    double distance = length(half) > 0 ? 0 : 1;
-    for (int corner = 0; corner < 8; ++corner) {
-        Vec3d p;
-        for (int a = 0; a < 3; ++a) {
-            p[a] = corner >> a & 1 ? half[a] : -half[a];
-        }
-        const double depth = -dot(p, camera.forward);
-        const double x = std::fabs(dot(p, camera.right)) / (camera.tangent * aspect);
-        const double y = std::fabs(dot(p, camera.up)) / camera.tangent;
-        distance = std::max(distance, depth + kMargin * std::max(x, y));
-    }
-    camera.eye = centre - distance * camera.forward;
-}
-
-Camera explicitCamera(const std::string& text) {
-    const std::vector<double> n = numberList("camera", text, 7);
-    const Vec3d eye{{n[0], n[1], n[2]}};
-    const Vec3d forward = Vec3d{{n[3], n[4], n[5]}} - eye;
-    if (!(length(forward) > 0) || !(n[6] > 0 && n[6] < 180)) {
-        throw UsageError("--camera " + text +
-                         ": expected ex,ey,ez,tx,ty,tz,fov with the eye away from the target and a "
-                         "vertical field of view between 0 and 180 degrees");
-    }
-    const Vec3d unit = normalized(forward);
-    Camera camera = look(unit, std::fabs(unit[1]) > 0.999 ? Vec3d{{0, 0, -1}} : Vec3d{{0, 1, 0}});
-    camera.eye = eye;
-    camera.tangent = std::tan(n[6] * 3.14159265358979323846 / 360);
-    return camera;
-}
 
 void parseResolution(const std::string& text, int& width, int& height) {
     char rest = 0;
@@ -106,6 +58,19 @@ void parseResolution(const std::string& text, int& width, int& height) {
     }
 }
 
+/// The camera of --camera, and what it looks at.
+std::pair<Camera, Vec3d> explicitCamera(const std::string& text) {
+    const std::vector<double> n = numberList("camera", text, 7);
+    const Vec3d eye{{n[0], n[1], n[2]}};
+    const Vec3d target{{n[3], n[4], n[5]}};
+    if (!(length(target - eye) > 0) || !(n[6] > 0 && n[6] < 180)) {
+        throw UsageError("--camera " + text +
+                         ": expected ex,ey,ez,tx,ty,tz,fov with the eye away from the target and a "
+                         "vertical field of view between 0 and 180 degrees");
+    }
+    return {vdbtools::cameraAt(eye, target, n[6]), target};
+}
+
 std::string formatNumber(double value) {
     std::ostringstream text;
     text.precision(9);
@@ -113,180 +78,270 @@ std::string formatNumber(double value) {
     return text.str();
 }
 
-/// Optical depth of the baked control per pixel, at scale 1.
-std::vector<double> renderDepth(const track::Volume& volume, const Camera& camera, int width,
-                                int height, uint32_t level, Progress* progress) {
+std::string formatVector(const Vec3d& v) {
+    return formatNumber(v[0]) + "," + formatNumber(v[1]) + "," + formatNumber(v[2]);
+}
+
+/// The name of frame `number`: in place of #### or %04d, or before the ending.
+std::string frameName(const std::string& pattern, int number) {
+    const size_t hashes = pattern.find('#');
+    const size_t percent = pattern.find("%0");
+    size_t begin = std::string::npos;
+    size_t end = 0;
+    size_t digits = 4;
+    if (hashes != std::string::npos) {
+        begin = hashes;
+        end = std::min(pattern.find_first_not_of('#', hashes), pattern.size());
+        digits = end - begin;
+    } else if (percent != std::string::npos && pattern.size() > percent + 3 &&
+               pattern[percent + 3] == 'd') {
+        begin = percent;
+        end = percent + 4;
+        digits = static_cast<size_t>(std::max(pattern[percent + 2] - '0', 0));
+    }
+    std::string text = std::to_string(number);
+    text.insert(0, digits > text.size() ? digits - text.size() : 0, '0');
+    if (begin == std::string::npos) {
+        std::filesystem::path path(pattern);
+        const std::string extension = path.extension().string();
+        return path.replace_extension().string() + "." + text + extension;
+    }
+    return pattern.substr(0, begin) + text + pattern.substr(end);
+}
+
+/// Optical depth of the control, per pixel and channel, at the volume's scale.
+std::vector<double> controlDepth(const track::Volume& volume, const Camera& camera, int width,
+                                 int height, uint32_t level) {
     TrkQuery query = trkDefaultQuery();
     query.method = TRK_METHOD_CONTROL;
     query.level = level;
-    std::vector<double> depth(static_cast<size_t>(width) * static_cast<size_t>(height));
-    std::vector<TrkRay> rays(static_cast<size_t>(width));
+    std::vector<TrkRay> rays;
     const double aspect = static_cast<double>(width) / height;
     for (int row = 0; row < height; ++row) {
         for (int column = 0; column < width; ++column) {
-            const double x = (2 * (column + 0.5) / width - 1) * camera.tangent * aspect;
-            const double y = (1 - 2 * (row + 0.5) / height) * camera.tangent;
-            const Vec3d d = normalized(camera.forward + x * camera.right + y * camera.up);
-            TrkRay& ray = rays[static_cast<size_t>(column)];
-            for (int a = 0; a < 3; ++a) {
-                ray.origin[a] = static_cast<float>(camera.eye[a]);
-                ray.direction[a] = static_cast<float>(d[a]);
-            }
-            ray.tMin = 0;
-            ray.tMax = std::numeric_limits<float>::infinity();
-        }
-        volume.integrateOpticalDepth(query, rays.data(), rays.size(),
-                                     &depth[static_cast<size_t>(row) * static_cast<size_t>(width)]);
-        if (progress) {
-            progress->update((row + 1.0) / height);
+            rays.push_back(camera.ray((column + 0.5) / width, (row + 0.5) / height, aspect));
         }
     }
+    std::vector<double> depth(rays.size() * volume.info().channels);
+    volume.integrateOpticalDepth(query, rays.data(), rays.size(), depth.data());
     return depth;
 }
 
-/// Narrows the field of view until what a small picture shows of the volume fills the frame: boxes
-/// are mostly empty at their corners.
-void zoom(Camera& camera, const track::Volume& volume, double aspect, uint32_t level) {
-    constexpr int kHeight = 96;
-    const int width = std::max(1, static_cast<int>(std::min(kHeight * aspect, 2048.0)));
-    const std::vector<double> depth = renderDepth(volume, camera, width, kHeight, level, nullptr);
+constexpr int kSketchHeight = 96;
+int sketchWidth(const Shot& shot) {
+    return std::max(1, static_cast<int>(std::min(kSketchHeight * shot.aspect(), 2048.0)));
+}
+
+/// Frames the volume in all frames: moves the camera back until its box is seen whole, then narrows
+/// the field of view until what small pictures show of it fills the frame, as boxes are mostly
+/// empty at their corners.
+void frameVolume(Shot& shot, const track::Volume& volume) {
+    const TrkVolumeInfo info = volume.info();
+    vdbtools::WorldBox box;
+    for (int a = 0; a < 3; ++a) {
+        box.lo[a] = info.boundsMin[a];
+        box.hi[a] = info.boundsMax[a];
+    }
+    shot.centre = box.centre();
+    const int frames = std::max(shot.frames, 1);
+    double distance = 0;
+    for (int frame = 0; frame < frames; ++frame) {
+        Camera camera = shot.cameraOf(frame);
+        vdbtools::frameBox(camera, box, shot.aspect());
+        distance = std::max(distance, length(camera.eye - shot.centre));
+    }
+    shot.camera.eye = shot.centre - distance * shot.camera.forward;
+    const int width = sketchWidth(shot);
     double reach = 0;
-    for (size_t i = 0; i < depth.size(); ++i) {
-        if (depth[i] > 0) {
-            const size_t whole = i / static_cast<size_t>(width);
-            const auto row = static_cast<double>(whole);
-            const auto column = static_cast<double>(i - whole * static_cast<size_t>(width));
-            reach = std::max({reach, std::fabs(2 * (column + 0.5) / width - 1) + 1.0 / width,
-                              std::fabs(2 * (row + 0.5) / kHeight - 1) + 1.0 / kHeight});
+    for (int frame = 0; frame < frames; ++frame) {
+        const std::vector<double> depth =
+            controlDepth(volume, shot.cameraOf(frame), width, kSketchHeight, shot.level);
+        for (size_t i = 0; i < depth.size(); ++i) {
+            if (depth[i] > 0) {
+                const size_t pixel = i / info.channels;
+                const size_t whole = pixel / static_cast<size_t>(width);
+                const auto row = static_cast<double>(whole);
+                const auto column = static_cast<double>(pixel - whole * static_cast<size_t>(width));
+                reach = std::max(
+                    {reach, std::fabs(2 * (column + 0.5) / width - 1) + 1.0 / width,
+                     std::fabs(2 * (row + 0.5) / kSketchHeight - 1) + 1.0 / kSketchHeight});
+            }
         }
     }
     if (reach > 0) {
-        camera.tangent *= std::min(1.0, 1.04 * reach);
+        shot.camera.tangent *= std::min(1.0, 1.04 * reach);
     }
 }
 
-/// The scale at which the median transmittance of the pixels that meet anything is 0.3.
-double defaultScale(const std::vector<double>& depth) {
+/// The scale at which the median transmittance of what meets anything is `median`, or 1 where
+/// nothing does.
+double defaultScale(const Shot& shot, const track::Volume& volume, double median) {
     std::vector<double> hits;
-    std::copy_if(depth.begin(), depth.end(), std::back_inserter(hits),
-                 [](double d) { return d > 0; });
+    for (const double depth :
+         controlDepth(volume, shot.camera, sketchWidth(shot), kSketchHeight, shot.level)) {
+        if (depth > 0) {
+            hits.push_back(depth);
+        }
+    }
     if (hits.empty()) {
         return 1;
     }
     const auto middle = hits.begin() + static_cast<std::ptrdiff_t>(hits.size() / 2);
     std::nth_element(hits.begin(), middle, hits.end());
-    return -std::log(0.3) / *middle;
+    return -std::log(median) / *middle;
 }
 
-/// Transmittance over a sky: the volume only takes light away.
-Image compose(const std::vector<double>& depth, double scale, int width, int height) {
-    Image image(width, height);
-    std::vector<float>& transmittance = image.add("transmittance");
+const std::array<std::string, 3> kRgb{"R", "G", "B"};
+
+Image litImage(vdbtools::Picture picture) {
+    Image image(picture.width, picture.height);
     std::vector<float>& alpha = image.add("A");
-    for (size_t i = 0; i < depth.size(); ++i) {
-        const double t = std::exp(-scale * depth[i]);
-        transmittance[i] = static_cast<float>(t);
-        alpha[i] = static_cast<float>(1 - t);
+    for (size_t i = 0; i < alpha.size(); ++i) {
+        alpha[i] = 1 - (picture.transmittance[0][i] + picture.transmittance[1][i] +
+                        picture.transmittance[2][i]) /
+                           3;
     }
-    const float zenith[3] = {0.20f, 0.42f, 0.86f};
-    const float horizon[3] = {1.00f, 0.90f, 0.74f};
-    const char* const names[] = {"R", "G", "B"};
     for (size_t c = 0; c < 3; ++c) {
-        std::vector<float>& channel = image.add(names[c]);
-        for (size_t i = 0; i < depth.size(); ++i) {
-            const size_t row = i / static_cast<size_t>(width);
-            const float down = (static_cast<float>(row) + 0.5f) / static_cast<float>(height);
-            channel[i] = (zenith[c] + (horizon[c] - zenith[c]) * down * down) *
-                         image.channels["transmittance"][i];
+        image.channels[kRgb[c]] = std::move(picture.beauty[c]);
+        image.channels["transmittance." + kRgb[c]] = std::move(picture.transmittance[c]);
+    }
+    image.channels["halfDepth.Z"] = std::move(picture.halfDepth);
+    return image;
+}
+
+/// The control's transmittance as it is: white where all light passes.
+Image transmittanceImage(const Shot& shot, const track::Volume& volume, const Camera& camera) {
+    Image image(shot.width, shot.height);
+    const std::vector<double> depth =
+        controlDepth(volume, camera, shot.width, shot.height, shot.level);
+    const size_t channels = volume.info().channels;
+    std::vector<float>& alpha = image.add("A");
+    for (size_t c = 0; c < 3; ++c) {
+        std::vector<float>& values = image.add(kRgb[c]);
+        for (size_t i = 0; i < values.size(); ++i) {
+            const double t = std::exp(-shot.scale * depth[i * channels + c % channels]);
+            values[i] = static_cast<float>(t);
+            alpha[i] += static_cast<float>((1 - t) / 3);
         }
     }
     return image;
 }
 
-void run(const Command& command, const std::vector<std::string>& given) {
-    po::options_description options("Options");
-    options.add_options()("output,o", po::value<std::string>(),
-                          "OUT.png (tone-mapped) or OUT.exr (float channels R,G,B,A and "
-                          "transmittance); default: SIDECAR.png beside the sidecar")(
-        "resolution", po::value<std::string>()->default_value("512x512"), "in pixels")(
-        "level", po::value<int>()->default_value(0),
-        "0: the baked super-voxels; k: super-voxels 2^k times as large")(
-        "scale", po::value<float>(),
-        "extinction = scale x density; default: the median transmittance becomes 0.3")(
-        "view", po::value<std::string>()->default_value("iso"),
-        "front, side, top or iso, framed on the volume; y is up")(
-        "camera", po::value<std::string>(),
-        "ex,ey,ez,tx,ty,tz,fov: eye, target, vertical field of view in degrees")(
-        "force", po::bool_switch(), "replace an existing file");
-    const Arguments arguments(command, given, options, {"SIDECAR"}, 1);
-    const std::string sidecar = arguments.text("SIDECAR");
-    int width = 0;
-    int height = 0;
-    parseResolution(arguments.text("resolution"), width, height);
-    choiceIndex("view", arguments.text("view"), kViews);
+void writeImage(const Shot& shot, const Image& image, const Camera& camera,
+                const std::string& gridName, const trk::OutputFile& file) {
+    if (std::filesystem::path(shot.output).extension() == ".png") {
+        writePng(image, shot.lit ? Tone::kRolledOff : Tone::kLinear, file);
+        return;
+    }
+    writeExr(image,
+             {{"track:source", std::filesystem::path(shot.sidecar).filename().string()},
+              {"track:grid", gridName},
+              {"track:scale", formatNumber(shot.scale)},
+              {"track:level", std::to_string(shot.level)},
+              {"track:eye", formatVector(camera.eye)},
+              {"track:forward", formatVector(camera.forward)},
+              {"track:verticalFov", formatNumber(360 / kPi * std::atan(camera.tangent))},
+              {"track:version", TRACK_VERSION}},
+             file);
+}
+
+Shot parseShot(const Arguments& arguments) {
+    Shot shot;
+    shot.sidecar = arguments.text("SIDECAR");
+    parseResolution(arguments.text("resolution"), shot.width, shot.height);
+    choiceIndex("view", arguments.text("view"), vdbtools::viewNames());
     if (arguments.given("view") && arguments.has("camera")) {
         throw UsageError("--view and --camera: expected one of them");
     }
-    const int level = arguments.integer("level", 0, 64);
-    Camera camera = arguments.has("camera") ? explicitCamera(arguments.text("camera"))
-                                            : standardView(arguments.text("view"));
-    double scale =
-        arguments.has("scale") ? static_cast<double>(nonNegative(arguments, "scale")) : 0;
-    const std::string output =
-        arguments.has("output") ? arguments.text("output")
-                                : std::filesystem::path(sidecar).replace_extension(".png").string();
-    const std::string extension = std::filesystem::path(output).extension().string();
-    if (extension != ".png" && extension != ".exr") {
-        throw UsageError("-o " + output + ": expected a name that ends in .png or .exr");
+    if (arguments.has("camera")) {
+        std::tie(shot.camera, shot.centre) = explicitCamera(arguments.text("camera"));
+    } else {
+        shot.camera = vdbtools::namedView(arguments.text("view"));
     }
+    shot.level = static_cast<uint32_t>(arguments.integer("level", 0, 64));
+    shot.frames = arguments.has("frames") ? arguments.integer("frames", 1, kMaxFrames) : 0;
+    shot.lit = !arguments.flag("transmittance");
+    shot.scale = arguments.has("scale") ? static_cast<double>(nonNegative(arguments, "scale")) : 0;
+    TrkVolumeOptions colored = trkDefaultVolumeOptions();
+    applyColor(arguments, colored);
+    std::copy_n(colored.color, 3, shot.color.begin());
+    shot.output = arguments.has("output")
+                      ? arguments.text("output")
+                      : std::filesystem::path(shot.sidecar).replace_extension(".png").string();
+    const std::string extension = std::filesystem::path(shot.output).extension().string();
+    if (extension != ".png" && extension != ".exr") {
+        throw UsageError("-o " + shot.output + ": expected a name that ends in .png or .exr");
+    }
+    return shot;
+}
 
-    refuseInput(output, {sidecar});
-    const track::Volume volume = track::Volume::open("", sidecar.c_str());
+void run(const Command& command, const std::vector<std::string>& given) {
+    po::options_description options("Options");
+    options.add_options()("output,o", po::value<std::string>(),
+                          "OUT.png (tone-mapped) or OUT.exr (float: R,G,B,A and the layers "
+                          "transmittance and halfDepth, the distance at which half the light is "
+                          "left); default: SIDECAR.png beside the sidecar")(
+        "transmittance", po::bool_switch(),
+        "draw the control's transmittance as it is, blocks and all, instead of a lit picture")(
+        "resolution", po::value<std::string>()->default_value("512x512"), "in pixels")(
+        "level", po::value<int>()->default_value(0),
+        "0: the baked super-voxels; k: super-voxels 2^k times as large, faster")(
+        "scale", po::value<float>(),
+        "extinction = scale x density; default: the median transmittance becomes 0.05, or 0.3 "
+        "with --transmittance")("view", po::value<std::string>()->default_value("iso"),
+                                "front, side, top or iso, framed on the volume; y is up")(
+        "camera", po::value<std::string>(),
+        "ex,ey,ez,tx,ty,tz,fov: eye, target, vertical field of view in degrees")(
+        "frames", po::value<int>(),
+        "turntable: that many pictures once around the volume, numbered in place of #### or %04d "
+        "in "
+        "OUT, or before its ending")("force", po::bool_switch(), "replace existing files");
+    addColorOption(options);
+    const Arguments arguments(command, given, options, {"SIDECAR"}, 1);
+    Shot shot = parseShot(arguments);
+
+    TrkVolumeOptions volumeOptions = trkDefaultVolumeOptions();
+    applyColor(arguments, volumeOptions);
+    const track::Volume volume = track::Volume::open("", shot.sidecar.c_str(), volumeOptions);
     const TrkVolumeInfo info = volume.info();
     if (!arguments.has("camera")) {
-        const double aspect = static_cast<double>(width) / height;
-        frame(camera, info, aspect);
-        zoom(camera, volume, aspect, static_cast<uint32_t>(level));
+        frameVolume(shot, volume);
     }
-    trk::OutputFile file(output, arguments.flag("force"));
-    std::vector<double> depth;
-    {
-        Progress progress(arguments, "drawing " + output);
-        depth = renderDepth(volume, camera, width, height, static_cast<uint32_t>(level), &progress);
-    }
+    const double median = shot.lit ? 0.05 : 0.3;
+    const bool chosen = !arguments.has("scale") && info.superVoxelCount > 0;
     if (!arguments.has("scale")) {
-        scale = defaultScale(depth);
+        shot.scale = defaultScale(shot, volume, median);
     }
-    const bool hits = std::any_of(depth.begin(), depth.end(), [](double d) { return d > 0; });
-    const Image image = compose(depth, scale, width, height);
-    std::ostringstream eye;
-    eye << formatNumber(camera.eye[0]) << "," << formatNumber(camera.eye[1]) << ","
-        << formatNumber(camera.eye[2]);
-    std::ostringstream forward;
-    forward << formatNumber(camera.forward[0]) << "," << formatNumber(camera.forward[1]) << ","
-            << formatNumber(camera.forward[2]);
-    if (extension == ".png") {
-        writePng(image, file);
-    } else {
-        writeExr(image,
-                 {{"track:source", std::filesystem::path(sidecar).filename().string()},
-                  {"track:grid", info.gridName},
-                  {"track:scale", formatNumber(scale)},
-                  {"track:level", std::to_string(level)},
-                  {"track:view",
-                   arguments.has("camera") ? std::string("camera") : arguments.text("view")},
-                  {"track:eye", eye.str()},
-                  {"track:forward", forward.str()},
-                  {"track:verticalFov",
-                   formatNumber(360 / 3.14159265358979323846 * std::atan(camera.tangent))},
-                  {"track:version", TRACK_VERSION}},
-                 file);
+    const int frames = std::max(shot.frames, 1);
+    const auto nameOf = [&](int frame) {
+        return shot.frames == 0 ? shot.output : frameName(shot.output, frame + 1);
+    };
+    for (int frame = 0; frame < frames; ++frame) {  // before any is written
+        refuseInput(nameOf(frame), {shot.sidecar});
+        trk::OutputFile(nameOf(frame), arguments.flag("force"));
     }
-    file.commit();
+    std::unique_ptr<vdbtools::LitPreview> lit;
+    if (shot.lit) {
+        const Progress progress(arguments, "lighting " + shot.sidecar);
+        lit = std::make_unique<vdbtools::LitPreview>(shot.sidecar, shot.level,
+                                                     static_cast<float>(shot.scale), shot.color);
+    }
+    for (int frame = 0; frame < frames; ++frame) {
+        const Camera camera = shot.cameraOf(frame);
+        trk::OutputFile file(nameOf(frame), arguments.flag("force"));
+        Progress progress(arguments, "drawing " + nameOf(frame));
+        const Image image = shot.lit ? litImage(lit->draw(camera, shot.width, shot.height,
+                                                          [&](double f) { progress.update(f); }))
+                                     : transmittanceImage(shot, volume, camera);
+        writeImage(shot, image, camera, info.gridName, file);
+        file.commit();
+    }
     if (!arguments.quiet()) {
-        std::cerr << output << ": " << width << "x" << height << ", scale " << formatNumber(scale)
-                  << (hits && !arguments.has("scale") ? " (median transmittance 0.3)" : "")
-                  << (hits ? "" : " (the picture is empty)") << ", level " << level << "\n";
+        std::cerr << nameOf(0) << (frames > 1 ? " to " + nameOf(frames - 1) : "") << ": "
+                  << shot.width << "x" << shot.height << ", scale " << formatNumber(shot.scale)
+                  << (chosen ? " (median transmittance " + formatNumber(median) + ")" : "")
+                  << (info.superVoxelCount == 0 ? " (the volume is empty)" : "") << ", level "
+                  << shot.level << "\n";
     }
 }
 
@@ -294,8 +349,9 @@ void run(const Command& command, const std::vector<std::string>& given) {
 
 const Command kPreviewCommand{
     "preview",
-    "vdbtrack preview SIDECAR [-o OUT.png|OUT.exr] [--resolution 512x512] [--level 0] [--scale S] "
-    "[--view front|side|top|iso | --camera ex,ey,ez,tx,ty,tz,fov] [--force]",
-    "Draws the transmittance of the baked control over a sky, without the density.", run};
+    "vdbtrack preview SIDECAR [-o OUT.png|OUT.exr] [--transmittance] [--resolution 512x512] "
+    "[--level 0] [--scale S] [--color 1,1,1] [--view front|side|top|iso | --camera "
+    "ex,ey,ez,tx,ty,tz,fov] [--frames N] [--force]",
+    "Draws the baked control, lit by a sun and a sky, without the density.", run};
 
 }  // namespace apps

@@ -134,6 +134,26 @@ class ExtinctionField {
     std::array<double, C> integrate(const LocalRay& ray, double t0, double t1, uint64_t& lookups,
                                     uint64_t& regions) const;
 
+    /// Calls `visit(t0, t1, depth)` for every cell of a brick and every constant region on the
+    /// ray's way where the density is not 0 throughout, until it answers false. `depth`: integral
+    /// of the density over [t0, t1], in voxel lengths, in closed form.
+    template <size_t C, class Visit>
+    void forEachCell(const LocalRay& ray, double t0, double t1, Visit&& visit) const {
+        table_.walk(
+            ray, t0, t1, [&](Entry entry, const Int3& lo, int, double tEnter, double tExit) {
+                if (isConstant(entry)) {
+                    std::array<double, C> depth;
+                    for (size_t c = 0; c < C; ++c) {
+                        depth[c] = static_cast<double>(constant(entry)[c]) * (tExit - tEnter);
+                    }
+                    return visit(tEnter, tExit, depth);
+                }
+                const size_t first = (entry - 1) * kBrickVertices * C;
+                return isHalf() ? walkBrick<C>(&halfs_[first], lo, ray, tEnter, tExit, visit)
+                                : walkBrick<C>(&floats_[first], lo, ray, tEnter, tExit, visit);
+            });
+    }
+
   private:
     /// One channel at the corners of a cell, of C that lie side by side.
     template <class Real, size_t C>
@@ -159,9 +179,10 @@ class ExtinctionField {
         return v0 + fx * (v1 - v0);
     }
 
-    template <size_t C, class Stored>
-    static void integrateBrick(const Stored* brick, const Int3& lo, const LocalRay& ray, double t0,
-                               double t1, uint64_t& lookups, std::array<double, C>& sum);
+    /// Visits the cells of one brick; whether to go on.
+    template <size_t C, class Stored, class Visit>
+    static bool walkBrick(const Stored* brick, const Int3& lo, const LocalRay& ray, double t0,
+                          double t1, Visit& visit);
 
     size_t channels_ = 1;
     SparseTable table_;
@@ -170,5 +191,68 @@ class ExtinctionField {
     std::vector<uint16_t> halfs_;
     IntBox box_;
 };
+
+template <size_t C, class Stored, class Visit>
+bool ExtinctionField::walkBrick(const Stored* brick, const Int3& lo, const LocalRay& ray, double t0,
+                                double t1, Visit& visit) {
+    constexpr std::ptrdiff_t kStride[3] = {81 * C, 9 * C, C};
+    constexpr double kGauss = 0.57735026918962576451;  // 1/sqrt(3)
+    double origin[3];
+    double cellOrigin[3];  // of the current cell: integers, as doubles
+    double planeStep[3];
+    double tPlane[3];
+    std::ptrdiff_t stride[3];
+    const Stored* corner = brick;
+    for (int a = 0; a < 3; ++a) {
+        origin[a] = ray.origin[a] - static_cast<double>(lo[static_cast<size_t>(a)]);
+        const bool backwards = ray.direction[a] < 0;
+        const double start = origin[a] + t0 * ray.direction[a];
+        const auto cell = std::min(std::max(static_cast<int>(start), 0), 7);
+        cellOrigin[a] = cell;
+        planeStep[a] = backwards ? -1 : 1;
+        stride[a] = backwards ? -kStride[a] : kStride[a];
+        corner += cell * kStride[a];
+        tPlane[a] = (cell + (backwards ? 0 : 1) - origin[a]) * ray.inverse[a];
+    }
+    double t = t0;
+    for (;;) {
+        int axis = tPlane[0] < tPlane[1] ? 0 : 1;
+        axis = tPlane[2] < tPlane[axis] ? 2 : axis;
+        const bool last = !(tPlane[axis] < t1);
+        const double tExit = last ? t1 : std::max(t, tPlane[axis]);
+        const double half = 0.5 * (tExit - t);
+        const double middle = t + half;
+        double centre[3];
+        double offset[3];
+        for (int a = 0; a < 3; ++a) {
+            centre[a] = origin[a] - cellOrigin[a] + middle * ray.direction[a];
+            offset[a] = half * kGauss * ray.direction[a];
+        }
+        // In double: near the far face of a cell next to empty space the value is the small
+        // difference between 1 and the fraction.
+        std::array<double, C> depth;
+        for (size_t c = 0; c < C; ++c) {
+            const Corners<double, C> corners(corner + c);
+            depth[c] = half * (interpolate<double>(corners, centre[0] - offset[0],
+                                                   centre[1] - offset[1], centre[2] - offset[2]) +
+                               interpolate<double>(corners, centre[0] + offset[0],
+                                                   centre[1] + offset[1], centre[2] + offset[2]));
+        }
+        if (!visit(t, tExit, depth)) {
+            return false;
+        }
+        if (last) {
+            return true;
+        }
+        cellOrigin[axis] += planeStep[axis];
+        if (cellOrigin[axis] < 0 || cellOrigin[axis] > 7) {
+            return true;
+        }
+        corner += stride[axis];
+        const double plane = cellOrigin[axis] + (planeStep[axis] > 0 ? 1 : 0);
+        tPlane[axis] = (plane - origin[axis]) * ray.inverse[axis];
+        t = tExit;
+    }
+}
 
 }  // namespace trk

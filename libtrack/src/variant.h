@@ -17,6 +17,7 @@ namespace trk {
 /// of kind K.
 template <size_t F, size_t C, ControlKind K>
 struct Variant {
+    static constexpr size_t kDensityChannels = F;
     static constexpr size_t kChannels = C;
     using Extinction = VolumeExtinction<F, C>;
 

@@ -120,11 +120,11 @@ case_main_job() {
     expect 0 info cloud.track.vdb
     contains stdout "16^3 voxels"
     expect 0 preview cloud.track.vdb -o cloud.png --resolution 64x48
-    contains stderr "median transmittance 0.3"
+    contains stderr "median transmittance 0.05"
     [ "$(head -c 4 cloud.png | tail -c 3)" = PNG ] || fail "cloud.png is no PNG"
     expect 0 preview cloud.track.vdb -o cloud.exr --level 1 --view top --scale 2
     [ "$(od -An -tx1 -N4 cloud.exr | tr -d ' ')" = 762f3101 ] || fail "cloud.exr is no EXR"
-    for attribute in track:scale track:view track:source transmittance; do
+    for attribute in track:scale track:eye track:source transmittance.G halfDepth.Z; do
         grep -qa "$attribute" cloud.exr || fail "cloud.exr lacks $attribute"
     done
     expect 0 preview cloud.track.vdb

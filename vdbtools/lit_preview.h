@@ -1,0 +1,57 @@
+// SPDX-License-Identifier: Apache-2.0
+// Lit pictures of a baked control: single scattering from a sun and a sky, no density needed.
+#pragma once
+
+#include "camera.h"
+#include "extinction_field.h"
+#include "volume.h"
+
+#include <array>
+#include <cstdint>
+#include <functional>
+#include <string>
+#include <vector>
+
+namespace vdbtools {
+
+/// What a camera sees, top row first, linear.
+struct Picture {
+    int width = 0;
+    int height = 0;
+    std::vector<float> beauty[3];         ///< in front of a sky
+    std::vector<float> transmittance[3];  ///< of the camera ray; equal where the volume is grey
+    /// Distance from the camera at which half the light is left (the mean over channels), or
+    /// infinity.
+    std::vector<float> halfDepth;
+};
+
+/// A level of a sidecar, lit. Control values are interpolated between the centres of super-voxels
+/// (those of a trilinear control between its corners, which is what they mean), so that pictures
+/// show no blocks: the interpolated extinction has the control's mass, and its optical depth is in
+/// closed form too. Light that was scattered once is what is seen, isotropically and without
+/// absorption.
+class LitPreview {
+  public:
+    /// Reads the level's grid and computes the light that arrives inside, in parallel. `level`: 0
+    /// for the baked control. Throws Error.
+    LitPreview(const std::string& sidecarPath, uint32_t level, float scale,
+               const std::array<float, 3>& color);
+
+    /// Draws in parallel; `progress(fraction)` is called now and then, from any thread.
+    Picture draw(const Camera& camera, int width, int height,
+                 const std::function<void(double)>& progress) const;
+
+    size_t bytes() const { return volume_.bytes() + light_.bytes(); }
+
+  private:
+    using Light = std::array<float, 3>;
+
+    Light lightAt(const trk::Vec3d& local) const;
+    void computeLight();
+    void drawPixel(const TrkRay& ray, Picture& picture, size_t pixel) const;
+
+    trk::Volume volume_;          // the interpolated control, as if it were a density
+    trk::ExtinctionField light_;  // what arrives, in three channels
+};
+
+}  // namespace vdbtools

@@ -172,42 +172,59 @@ void CornerFit::solve(const std::vector<double>& right, std::vector<double>& x) 
 void CornerFit::fit(const std::vector<Cell>& cells) {
     const size_t n = values_.size();
     std::vector<double> right(n, 0);
-    std::vector<double> share(n, 0);  // of a super-voxel's mass, per density at the corner
-    double mass = 0;
+    std::vector<double> mass(cells.size(), 0);  // per super-voxel, as is every mass here
     for (size_t i = 0; i < cells.size(); ++i) {
         for (size_t k = 0; k < 8; ++k) {
             right[cornersOf_[i][k]] += (*cells[i].moments)[k];
-            share[cornersOf_[i][k]] += 0.125;
-            mass += (*cells[i].moments)[k];
+            mass[i] += (*cells[i].moments)[k];
         }
     }
-    // Corners that least squares would make negative are held at 0, and the others fitted again.
+    // Corners that the fit would make negative are held at 0, and the others fitted again.
     constexpr int kMaxRounds = 12;
-    std::vector<double> perMass(n, 0);
     for (int round = 0; round < kMaxRounds; ++round) {
         solve(right, values_);
-        solve(share, perMass);
-        double fitted = 0;
-        double response = 0;
-        for (size_t i = 0; i < n; ++i) {
-            fitted += share[i] * values_[i];
-            response += free_[i] ? share[i] * perMass[i] : 0;
-        }
-        const double multiplier = response > 0 ? (mass - fitted) / response : 0;
+        keepMass(mass);
         bool negative = false;
         for (size_t i = 0; i < n; ++i) {
-            if (free_[i]) {
-                values_[i] += multiplier * perMass[i];
-                if (values_[i] < 0) {
-                    values_[i] = perMass[i] = 0;
-                    free_[i] = 0;
-                    negative = true;
-                }
+            if (free_[i] && values_[i] < 0) {
+                values_[i] = 0;
+                free_[i] = 0;
+                negative = true;
             }
         }
         if (!negative) {
             break;
         }
+    }
+}
+
+/// Least squares alone would add mass: beside empty super-voxels, where corners are 0, the next
+/// ones overshoot. The whole mass is corrected there, where single super-voxels' masses are off,
+/// and not in parts that fit.
+void CornerFit::keepMass(const std::vector<double>& mass) {
+    const size_t n = values_.size();
+    std::vector<double> weight(n, 0);
+    std::vector<double> share(n, 0);  // of a super-voxel's mass, per density at the corner
+    double excess = 0;
+    for (size_t i = 0; i < mass.size(); ++i) {
+        double fitted = 0;
+        for (const uint32_t corner : cornersOf_[i]) {
+            fitted += 0.125 * values_[corner];
+        }
+        excess += fitted - mass[i];
+        for (const uint32_t corner : cornersOf_[i]) {
+            weight[corner] += std::fabs(fitted - mass[i]);
+            share[corner] += 0.125;
+        }
+    }
+    std::vector<double> direction(n, 0);
+    solve(weight, direction);
+    double response = 0;
+    for (size_t i = 0; i < n; ++i) {
+        response += free_[i] ? share[i] * direction[i] : 0;
+    }
+    for (size_t i = 0; i < n && response > 0; ++i) {
+        values_[i] -= free_[i] ? excess / response * direction[i] : 0;
     }
 }
 

@@ -50,6 +50,7 @@ class CornerFit {
     void multiply(const std::vector<double>& x, std::vector<double>& result) const;
     void solve(const std::vector<double>& right, std::vector<double>& x) const;
     void fit(const std::vector<Cell>& cells);
+    void keepMass(const std::vector<double>& mass);
 
     int size_;
     std::vector<std::array<uint32_t, 8>> cornersOf_;     // of each cell

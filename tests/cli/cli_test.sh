@@ -101,6 +101,10 @@ case_usage() {
     usage "--resolution 70000x5" preview x --resolution 70000x5
     usage "--resolution 5" preview x --resolution 5
     usage "--view back" preview x --view back
+    usage "--frames 0" preview x --frames 0
+    usage "--color 1,2" preview x --color 1,2
+    usage "--color 1,-2,3" query cloud.vdb --rays r.csv --color 1,-2,3
+    usage "--color 1,x,3" query cloud.vdb --rays r.csv --color 1,x,3
     usage "--camera 1,2" preview x --camera 1,2
     usage ".png or .exr" preview x -o x.jpg
     absent cloud.track.vdb
@@ -132,6 +136,74 @@ case_main_job() {
     some_rays
     expect 0 query cloud.vdb --rays rays.csv
     [ "$(wc -l <stdout)" = 5 ] || fail "expected a header and 4 rows"
+}
+
+case_colour() {
+    expect 0 make color.vdb --kind color-cloud --voxels 48
+    contains stderr "color-cloud"
+    some_rays
+    for control in constant trilinear affine; do
+        expect 0 bake color.vdb --size 8 --control $control --force
+        expect 0 verify color.vdb
+        contains stderr "all bounds hold"
+        expect 0 info color.track.vdb
+        contains stdout "channels      3"
+        contains stdout "control       $control"
+        contains stdout "residual RMS"
+        expect 0 query color.vdb --rays rays.csv --method exact --color 1,0.5,0
+        header=ray,transmittance_r,transmittance_g,transmittance_b,stderr_r,stderr_g,stderr_b
+        header=$header,optical_depth_r,optical_depth_g,optical_depth_b,lookups
+        [ "$(head -n 1 stdout)" = "$header" ] || fail "header: $(head -n 1 stdout)"
+        awk -F, 'NR > 1 && ($4 != 1 || NF != 11) { exit 1 }' stdout || fail "rows: $(cat stdout)"
+        awk -F, 'NR == 2 && !($2 < 1 && $3 < 1 && $2 != $3) { exit 1 }' stdout ||
+            fail "channels that should differ: $(cat stdout)"
+        cp stdout exact.csv
+        expect 0 query color.vdb --rays rays.csv --samples 4000 --color 1,0.5,0
+        paste -d, exact.csv stdout | awk -F, 'NR > 1 {
+            for (c = 2; c <= 4; ++c) {
+                d = $c - $(c + 11); if (d < 0) d = -d
+                if (d > 5 * $(c + 14) + 1e-6) { print; exit 1 }
+            } }' >bad || fail "$control: $(cat bad)"
+        expect 0 preview color.track.vdb -o color.png --resolution 32x32 --force
+        expect 0 preview color.track.vdb --transmittance -o plain.png --resolution 32x32 --force
+        cmp -s color.png plain.png && fail "--transmittance draws the lit picture"
+    done
+    small_cloud
+    expect 0 bake cloud.vdb --size 8 --control affine
+    expect 1 query cloud.vdb --rays rays.csv --choice max
+    one_line "choice min and max are constant controls"
+    expect 0 query cloud.vdb --rays rays.csv --color 2,2,2
+    [ "$(head -n 1 stdout)" = "ray,transmittance,stderr,optical_depth,lookups" ] ||
+        fail "a tint that is none: $(head -n 1 stdout)"
+    expect 0 query cloud.vdb --rays rays.csv --color 2,2,1
+    contains stdout "transmittance_b"
+    # A volume so thin that every corner of a trilinear control lies beside nothing.
+    expect 0 make thin.vdb --voxels 16
+    expect 0 bake thin.vdb --size 64 --control trilinear
+    contains stderr "keeps 0 % of the density's mass"
+}
+
+case_turntable() {
+    baked_cloud
+    expect 0 preview cloud.track.vdb -o turn.png --frames 3 --resolution 40x30
+    for frame in 0001 0002 0003; do
+        exists turn.$frame.png
+    done
+    absent turn.0004.png
+    absent turn.png
+    cmp -s turn.0001.png turn.0002.png && fail "the camera does not turn"
+    expect 0 preview cloud.track.vdb -o 'a.##.exr' --frames 2 --resolution 8x8 --level 1
+    exists a.01.exr
+    exists a.02.exr
+    expect 0 preview cloud.track.vdb -o 'b%03d.png' --frames 1 --resolution 8x8 --view side
+    exists b001.png
+    rm turn.0001.png turn.0003.png
+    expect 1 preview cloud.track.vdb -o turn.png --frames 3 --resolution 40x30
+    one_line "turn.0002.png: exists already"
+    absent turn.0001.png
+    expect 1 preview cloud.track.vdb -o x.png --level 5
+    one_line "level 5: expected 0 to 4"
+    absent x.png
 }
 
 case_kinds_and_seeds() {
@@ -402,6 +474,10 @@ case_vdb_print() {
         density_control_level_1 "track_super_voxel_size: 8" "track_source_grid: density"; do
         contains printed "$text"
     done
+    expect 0 bake cloud.vdb --size 8 --control affine --force
+    vdb_print -l cloud.track.vdb >printed 2>&1 || fail "vdb_print: $(cat printed)"
+    contains printed density_control_gradient
+    contains printed density_deviation
 }
 
 if [ $# -lt 2 ]; then

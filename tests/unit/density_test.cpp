@@ -272,9 +272,21 @@ std::string noisyFile(const char* name) {
     return fixtures::write(name, {grid});
 }
 
+openvdb::Vec3SGrid::Ptr noisyColor() {
+    std::mt19937 random(5);
+    std::uniform_real_distribution<float> unit(0.1f, 1);
+    return fixtures::makeColorGrid(CoordBBox(0, 0, 0, 20, 20, 20), [&](const Coord&) {
+        return openvdb::Vec3f(unit(random), unit(random), unit(random));
+    });
+}
+
 TEST(LoadDensity, SurvivesDamage) {
+    auto halfColor = noisyColor();
+    halfColor->setSaveFloatAsHalf(true);
     for (const std::string& good :
-         {noisyFile("noisy.vdb"), fixtures::write("smooth.vdb", {fixtures::makeBlob(40)})}) {
+         {noisyFile("noisy.vdb"), fixtures::write("smooth.vdb", {fixtures::makeBlob(40)}),
+          fixtures::write("noisy-color.vdb", {noisyColor()}),
+          fixtures::write("noisy-half-color.vdb", {halfColor})}) {
         EXPECT_GT(fixtures::load(good).summary.max, 0.0f);
         std::ifstream stream(good, std::ios::binary);
         const std::string bytes((std::istreambuf_iterator<char>(stream)),

@@ -17,6 +17,24 @@ namespace {
 
 namespace po = boost::program_options;
 
+/// Says where a control that varies is worse than the constant one would be.
+void warnOfBadFit(const std::string& output, const trk::BakedVolume& baked) {
+    const vdbtools::ControlFit fit = vdbtools::measureFit(baked);
+    char text[160] = "";
+    if (std::fabs(fit.massRatio - 1) > 0.01) {
+        std::snprintf(text, sizeof(text),
+                      "keeps %.3g %% of the density's mass, as it is 0 beside empty super-voxels",
+                      100 * fit.massRatio);
+    } else if (fit.residualRms > fit.constantRms) {
+        std::snprintf(text, sizeof(text), "leaves a residual RMS of %.3g, a constant one %.3g",
+                      fit.residualRms, fit.constantRms);
+    }
+    if (*text) {
+        std::cerr << "vdbtrack: warning: " << output << ": the " << trk::controlName(baked.kind)
+                  << " control " << text << "; prefer --control affine, or a smaller --size\n";
+    }
+}
+
 void run(const Command& command, const std::vector<std::string>& given) {
     po::options_description options("Options");
     options.add_options()("output,o", po::value<std::string>(),
@@ -91,14 +109,8 @@ void run(const Command& command, const std::vector<std::string>& given) {
         std::cerr << "vdbtrack: warning: " << input << ": grid " << summary.grid.name
                   << " is empty; its sidecar holds nothing and its transmittance is 1\n";
     }
-    const double mass = vdbtools::measureFit(baked).massRatio;
-    if (std::fabs(mass - 1) > 0.01 && !arguments.quiet()) {
-        char text[200];
-        std::snprintf(text, sizeof(text),
-                      ": the %s control keeps %.3g %% of the density's mass, as it is 0 beside empty "
-                      "super-voxels; expected 99 to 101: prefer --control affine, or a smaller --size",
-                      trk::controlName(bakeOptions.kind), 100 * mass);
-        std::cerr << "vdbtrack: warning: " << output << text << "\n";
+    if (!arguments.quiet()) {
+        warnOfBadFit(output, baked);
     }
     if (!arguments.quiet()) {
         std::cerr << output << ": " << baked.table.occupiedItems() << " super-voxels of " << size
@@ -117,10 +129,11 @@ void run(const Command& command, const std::vector<std::string>& given) {
 
 }  // namespace
 
-const Command kBakeCommand{
-    "bake",
-    "vdbtrack bake IN.vdb [-o OUT.track.vdb] [--grid NAME] [--size 16] [--control constant|affine|trilinear] "
-    "[--levels 4] [--force]",
-    "Bakes control extinction and bounds of the residual into a sidecar.", run};
+const Command kBakeCommand{"bake",
+                           "vdbtrack bake IN.vdb [-o OUT.track.vdb] [--grid NAME] [--size 16] "
+                           "[--control constant|affine|trilinear] "
+                           "[--levels 4] [--force]",
+                           "Bakes control extinction and bounds of the residual into a sidecar.",
+                           run};
 
 }  // namespace apps

@@ -114,15 +114,17 @@ void addColorOption(po::options_description& options) {
                           "differ tint a density of one channel");
 }
 
-void applyColor(const Arguments& arguments, TrkVolumeOptions& options) {
+std::array<float, 3> colorOf(const Arguments& arguments) {
     const std::string text = arguments.text("color");
-    const std::vector<double> color = numberList("color", text, 3);
+    const std::vector<double> numbers = numberList("color", text, 3);
+    std::array<float, 3> color{};
     for (size_t c = 0; c < 3; ++c) {
-        options.color[c] = static_cast<float>(color[c]);
-        if (!(color[c] >= 0) || !std::isfinite(options.color[c])) {
+        color[c] = static_cast<float>(numbers[c]);
+        if (!(color[c] >= 0) || !std::isfinite(color[c])) {
             throw UsageError("--color " + text + ": expected three finite numbers >= 0");
         }
     }
+    return color;
 }
 
 float nonNegative(const Arguments& arguments, const std::string& option) {

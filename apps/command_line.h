@@ -6,6 +6,7 @@
 
 #include <boost/program_options.hpp>
 
+#include <array>
 #include <stdexcept>
 #include <string>
 #include <vector>
@@ -74,8 +75,7 @@ uint32_t repairBits(const Arguments& arguments);
 
 /// --color r,g,b: what each channel's extinction is multiplied by.
 void addColorOption(boost::program_options::options_description& options);
-/// Its value, written to the options of a volume.
-void applyColor(const Arguments& arguments, TrkVolumeOptions& options);
+std::array<float, 3> colorOf(const Arguments& arguments);
 
 /// A finite number >= 0, or a UsageError that names the option.
 float nonNegative(const Arguments& arguments, const std::string& option);

@@ -45,7 +45,7 @@ else
     run make "$vdb" --force
 fi
 sidecar=$out/$name.track.vdb
-run bake "$vdb" -o "$sidecar" --size 8 --force
+run bake "$vdb" -o "$sidecar" --size 4 --force
 run verify "$vdb" "$sidecar"
 run info "$sidecar"
 scale=$(run preview "$sidecar" -o "$out/$name.png" --force 2>&1 | tee /dev/stderr |
@@ -71,13 +71,14 @@ done
 cat <<TEXT
 
 Done. In $out:
-  $name.png  the control's transmittance, as a picture
-  $name.exr  the same as float channels R,G,B,A,transmittance
+  $name.png  the baked control in sun and sky
+  $name.exr  the same in float, with layers for transmittance and the depth at which half is left
   $name.track.vdb  the sidecar: an ordinary VDB with control and residual bounds
   rays.csv  the rays of the two tables above
 
 Next: look at $out/$name.png, then try
   $vdbtrack --help
   apps/demo.sh YOUR_OWN.vdb
-  $vdbtrack bake YOUR_OWN.vdb --size 4     (smaller super-voxels: less noise, larger sidecar)
+  $vdbtrack preview $sidecar -o $out/turn.png --frames 24
+  $vdbtrack bake YOUR_OWN.vdb --control affine     (less noise at the same size)
 TEXT

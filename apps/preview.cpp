@@ -14,6 +14,7 @@
 #include <cmath>
 #include <cstdio>
 #include <filesystem>
+#include <functional>
 #include <iostream>
 #include <memory>
 #include <sstream>
@@ -82,10 +83,15 @@ std::string formatVector(const Vec3d& v) {
     return formatNumber(v[0]) + "," + formatNumber(v[1]) + "," + formatNumber(v[2]);
 }
 
-/// The name of frame `number`: in place of #### or %04d, or before the ending.
+/// The name of frame `number`: in place of #### or %04d in the file's name, or before its ending.
 std::string frameName(const std::string& pattern, int number) {
-    const size_t hashes = pattern.find('#');
-    const size_t percent = pattern.find("%0");
+    const size_t name = pattern.find_last_of('/') + 1;  // 0 where there is no folder
+    const size_t hashes = pattern.find('#', name);
+    const size_t percent = pattern.find("%0", name);
+    const auto isDigitBeforeD = [&](size_t at) {
+        return at + 1 < pattern.size() && pattern[at] >= '1' && pattern[at] <= '9' &&
+               pattern[at + 1] == 'd';
+    };
     size_t begin = std::string::npos;
     size_t end = 0;
     size_t digits = 4;
@@ -93,11 +99,10 @@ std::string frameName(const std::string& pattern, int number) {
         begin = hashes;
         end = std::min(pattern.find_first_not_of('#', hashes), pattern.size());
         digits = end - begin;
-    } else if (percent != std::string::npos && pattern.size() > percent + 3 &&
-               pattern[percent + 3] == 'd') {
+    } else if (percent != std::string::npos && isDigitBeforeD(percent + 2)) {
         begin = percent;
         end = percent + 4;
-        digits = static_cast<size_t>(std::max(pattern[percent + 2] - '0', 0));
+        digits = static_cast<size_t>(pattern[percent + 2] - '0');
     }
     std::string text = std::to_string(number);
     text.insert(0, digits > text.size() ? digits - text.size() : 0, '0');
@@ -109,21 +114,26 @@ std::string frameName(const std::string& pattern, int number) {
     return pattern.substr(0, begin) + text + pattern.substr(end);
 }
 
-/// Optical depth of the control, per pixel and channel, at the volume's scale.
-std::vector<double> controlDepth(const track::Volume& volume, const Camera& camera, int width,
-                                 int height, uint32_t level) {
+/// Optical depth of the control, per pixel and channel, at the volume's scale, row by row.
+std::vector<double> controlDepth(
+    const track::Volume& volume, const Camera& camera, int width, int height, uint32_t level,
+    const std::function<void(double)>& progress = [](double) {}) {
     TrkQuery query = trkDefaultQuery();
     query.method = TRK_METHOD_CONTROL;
     query.level = level;
-    std::vector<TrkRay> rays;
+    const size_t rowSize = static_cast<size_t>(width) * volume.info().channels;
+    std::vector<double> depth(rowSize * static_cast<size_t>(height));
+    std::vector<TrkRay> rays(static_cast<size_t>(width));
     const double aspect = static_cast<double>(width) / height;
     for (int row = 0; row < height; ++row) {
         for (int column = 0; column < width; ++column) {
-            rays.push_back(camera.ray((column + 0.5) / width, (row + 0.5) / height, aspect));
+            rays[static_cast<size_t>(column)] =
+                camera.ray((column + 0.5) / width, (row + 0.5) / height, aspect);
         }
+        volume.integrateOpticalDepth(query, rays.data(), rays.size(),
+                                     &depth[static_cast<size_t>(row) * rowSize]);
+        progress((row + 1.0) / height);
     }
-    std::vector<double> depth(rays.size() * volume.info().channels);
-    volume.integrateOpticalDepth(query, rays.data(), rays.size(), depth.data());
     return depth;
 }
 
@@ -210,10 +220,11 @@ Image litImage(vdbtools::Picture picture) {
 }
 
 /// The control's transmittance as it is: white where all light passes.
-Image transmittanceImage(const Shot& shot, const track::Volume& volume, const Camera& camera) {
+Image transmittanceImage(const Shot& shot, const track::Volume& volume, const Camera& camera,
+                         const std::function<void(double)>& progress) {
     Image image(shot.width, shot.height);
     const std::vector<double> depth =
-        controlDepth(volume, camera, shot.width, shot.height, shot.level);
+        controlDepth(volume, camera, shot.width, shot.height, shot.level, progress);
     const size_t channels = volume.info().channels;
     std::vector<float>& alpha = image.add("A");
     for (size_t c = 0; c < 3; ++c) {
@@ -262,9 +273,7 @@ Shot parseShot(const Arguments& arguments) {
     shot.frames = arguments.has("frames") ? arguments.integer("frames", 1, kMaxFrames) : 0;
     shot.lit = !arguments.flag("transmittance");
     shot.scale = arguments.has("scale") ? static_cast<double>(nonNegative(arguments, "scale")) : 0;
-    TrkVolumeOptions colored = trkDefaultVolumeOptions();
-    applyColor(arguments, colored);
-    std::copy_n(colored.color, 3, shot.color.begin());
+    shot.color = colorOf(arguments);
     shot.output = arguments.has("output")
                       ? arguments.text("output")
                       : std::filesystem::path(shot.sidecar).replace_extension(".png").string();
@@ -301,7 +310,7 @@ void run(const Command& command, const std::vector<std::string>& given) {
     Shot shot = parseShot(arguments);
 
     TrkVolumeOptions volumeOptions = trkDefaultVolumeOptions();
-    applyColor(arguments, volumeOptions);
+    std::copy(shot.color.begin(), shot.color.end(), volumeOptions.color);
     const track::Volume volume = track::Volume::open("", shot.sidecar.c_str(), volumeOptions);
     const TrkVolumeInfo info = volume.info();
     if (!arguments.has("camera")) {
@@ -330,9 +339,9 @@ void run(const Command& command, const std::vector<std::string>& given) {
         const Camera camera = shot.cameraOf(frame);
         trk::OutputFile file(nameOf(frame), arguments.flag("force"));
         Progress progress(arguments, "drawing " + nameOf(frame));
-        const Image image = shot.lit ? litImage(lit->draw(camera, shot.width, shot.height,
-                                                          [&](double f) { progress.update(f); }))
-                                     : transmittanceImage(shot, volume, camera);
+        const auto update = [&](double fraction) { progress.update(fraction); };
+        const Image image = shot.lit ? litImage(lit->draw(camera, shot.width, shot.height, update))
+                                     : transmittanceImage(shot, volume, camera, update);
         writeImage(shot, image, camera, info.gridName, file);
         file.commit();
     }

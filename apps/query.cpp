@@ -7,6 +7,8 @@
 #include "io/sidecar.h"
 #include "track/track.hpp"
 
+#include <algorithm>
+#include <array>
 #include <cerrno>
 #include <charconv>
 #include <cmath>
@@ -151,8 +153,8 @@ void run(const Command& command, const std::vector<std::string>& given) {
         "multiplies the sampling rate of residual and ratio")(
         "choice", po::value<std::string>()->default_value("robust"),
         "control of the residual method: robust, mean, min or max (the last two only where it was "
-        "baked constant)")(
-        "level", po::value<int>()->default_value(0), "preview level of the control method")(
+        "baked constant)")("level", po::value<int>()->default_value(0),
+                           "preview level of the control method")(
         "seed", po::value<uint64_t>()->default_value(0), "of the random numbers")(
         "stream", po::value<uint64_t>()->default_value(0), "independent random numbers")(
         "scale", po::value<float>()->default_value(1.0f, "1"), "extinction = scale x density")(
@@ -177,7 +179,8 @@ void run(const Command& command, const std::vector<std::string>& given) {
     query.stream = arguments.get<uint64_t>("stream");
     TrkVolumeOptions volumeOptions = trkDefaultVolumeOptions();
     volumeOptions.scale = nonNegative(arguments, "scale");
-    applyColor(arguments, volumeOptions);
+    const std::array<float, 3> color = colorOf(arguments);
+    std::copy(color.begin(), color.end(), volumeOptions.color);
     volumeOptions.choice = choiceIndex("choice", arguments.text("choice"), kChoices);
     volumeOptions.repair = repairBits(arguments);
     const std::string grid = arguments.text("grid");
@@ -258,6 +261,7 @@ const Command kQueryCommand{
     "[--samples 16] [--rate 1] [--choice robust] [--level 0] [--seed 0] [--stream 0] [--scale 1] "
     "[--color 1,1,1] [-o OUT.csv] [--force]",
     "Prints the transmittance of rays: ray,transmittance,stderr,optical_depth,lookups; in colour "
-    "with _r, _g, _b.", run};
+    "with _r, _g, _b.",
+    run};
 
 }  // namespace apps

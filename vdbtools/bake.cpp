@@ -2,7 +2,6 @@
 #include "bake.h"
 
 #include "control_fit.h"
-#include "hash.h"
 
 #include <tbb/blocked_range.h>
 #include <tbb/parallel_for.h>
@@ -20,11 +19,11 @@ namespace {
 
 using trk::BakedSuperVoxel;
 using trk::BakedVolume;
+using trk::ControlKind;
+using trk::ControlPolynomial;
 using trk::ExtinctionField;
 using trk::Int3;
 using trk::roundUp;
-using trk::ControlKind;
-using trk::ControlPolynomial;
 using trk::SparseTable;
 using trk::ValueTable;
 using trk::Vec3d;
@@ -39,14 +38,16 @@ struct Moments {
     float max = 0;
     double mean = 0;
     double squares = 0;
-    CornerMoments corners{};  ///< where a fit asks for them
 };
 
 Moments constantMoments(float value) {
-    const auto v = static_cast<double>(value);
-    Moments m{value, value, v, 0, {}};
-    m.corners.fill(0.125 * v);
-    return m;
+    return {value, value, static_cast<double>(value), 0};
+}
+
+CornerMoments constantCorners(float value) {
+    CornerMoments corners{};
+    corners.fill(0.125 * static_cast<double>(value));
+    return corners;
 }
 
 double trapezoid(size_t i, size_t last) {
@@ -95,7 +96,7 @@ CornerMoments cornerMoments(const BrickChannel& brick, size_t size) {
 /// Moments of one cube of `size`^3 cells of a brick. Two passes over values that are in L1:
 /// deviations from the mean do not cancel, and a cube of equal values has a mean of that very
 /// value.
-Moments cubeMoments(const BrickChannel& brick, size_t size, bool withCorners) {
+Moments cubeMoments(const BrickChannel& brick, size_t size) {
     const auto weighted = [&](const auto& term) {
         double sum = 0;
         for (size_t x = 0; x <= size; ++x) {
@@ -132,9 +133,6 @@ Moments cubeMoments(const BrickChannel& brick, size_t size, bool withCorners) {
         const double d = static_cast<double>(v) - m.mean;
         return d * d;
     });
-    if (withCorners) {
-        m.corners = cornerMoments(brick, size);
-    }
     return m;
 }
 
@@ -155,9 +153,13 @@ class Baker {
     BakedVolume bake() {
         planSuperVoxels();
         moments_.resize(jobs_.size() * channels_);
+        corners_.resize(kind_ == ControlKind::kConstant ? 0 : moments_.size());
         forEach(jobs_.size(), [&](size_t i) {
             for (size_t c = 0; c < channels_; ++c) {
                 moments_[i * channels_ + c] = momentsOf(jobs_[i], c);
+                if (kind_ != ControlKind::kConstant) {
+                    corners_[i * channels_ + c] = cornersOf(jobs_[i], c);
+                }
             }
         });
         baked_.superVoxelShift = shift_;
@@ -196,6 +198,7 @@ class Baker {
         const size_t perAxis = 8 / edge;
         const size_t cubesPerBrick = perAxis * perAxis * perAxis;
         cubes_.resize(field_.brickCount() * cubesPerBrick * channels_);
+        cubeCorners_.resize(kind_ == ControlKind::kConstant ? 0 : cubes_.size());
         forEach(field_.brickCount(), [&](size_t b) {
             float vertices[ExtinctionField::kBrickVertices];
             for (size_t c = 0; c < channels_; ++c) {
@@ -207,8 +210,11 @@ class Baker {
                     const size_t y = k / perAxis % perAxis * edge;
                     const size_t z = k % perAxis * edge;
                     const BrickChannel brick{BrickChannel{vertices}.row(x, y) + z};
-                    cubes_[(b * cubesPerBrick + k) * channels_ + c] =
-                        cubeMoments(brick, edge, kind_ != ControlKind::kConstant);
+                    const size_t cube = (b * cubesPerBrick + k) * channels_ + c;
+                    cubes_[cube] = cubeMoments(brick, edge);
+                    if (kind_ != ControlKind::kConstant) {
+                        cubeCorners_[cube] = cornerMoments(brick, edge);
+                    }
                 }
             }
         });
@@ -259,39 +265,49 @@ class Baker {
         }
     }
 
-    Moments cubeAt(Entry entry, const Int3& inBrick, size_t channel) const {
-        if (ExtinctionField::isConstant(entry)) {
-            return constantMoments(field_.constant(entry)[channel]);
-        }
+    /// Index of a brick's cube and channel.
+    size_t cubeIndex(Entry entry, const Int3& inBrick, size_t channel) const {
         const int64_t perAxis = 8 / cube_;
         const int64_t within =
             (inBrick[0] / cube_ * perAxis + inBrick[1] / cube_) * perAxis + inBrick[2] / cube_;
         const size_t cube = (entry - 1) * static_cast<size_t>(perAxis * perAxis * perAxis) +
                             static_cast<size_t>(within);
-        return cubes_[cube * channels_ + channel];
+        return cube * channels_ + channel;
+    }
+    Moments cubeAt(Entry entry, const Int3& inBrick, size_t channel) const {
+        return ExtinctionField::isConstant(entry) ? constantMoments(field_.constant(entry)[channel])
+                                                  : cubes_[cubeIndex(entry, inBrick, channel)];
     }
 
     Moments momentsOf(const Int3& origin, size_t channel) const {
-        const double count = std::pow(size_ / cube_, 3);
         Moments all;
         all.min = kInfinity;
-        forEachCube(origin, [&](const Int3& offset, Entry entry, const Int3& inBrick) {
+        forEachCube(origin, [&](const Int3&, Entry entry, const Int3& inBrick) {
             const Moments m = cubeAt(entry, inBrick, channel);
             all.min = std::min(all.min, m.min);
             all.max = std::max(all.max, m.max);
             all.mean += m.mean;
-            if (kind_ != ControlKind::kConstant) {
-                addCorners(m.corners, offset, 1 / count, all.corners);
-            }
         });
         if (all.min == all.max) {
             return constantMoments(all.min);
         }
-        all.mean /= count;
+        all.mean /= std::pow(size_ / cube_, 3);
         const auto cells = static_cast<double>(cube_ * cube_ * cube_);
         forEachCube(origin, [&](const Int3&, Entry entry, const Int3& inBrick) {
             const Moments m = cubeAt(entry, inBrick, channel);  // [Chan, Golub, LeVeque 1979]
             all.squares += m.squares + cells * (m.mean - all.mean) * (m.mean - all.mean);
+        });
+        return all;
+    }
+
+    CornerMoments cornersOf(const Int3& origin, size_t channel) const {
+        CornerMoments all{};
+        const double share = 1 / std::pow(size_ / cube_, 3);
+        forEachCube(origin, [&](const Int3& offset, Entry entry, const Int3& inBrick) {
+            addCorners(ExtinctionField::isConstant(entry)
+                           ? constantCorners(field_.constant(entry)[channel])
+                           : cubeCorners_[cubeIndex(entry, inBrick, channel)],
+                       offset, share, all);
         });
         return all;
     }
@@ -345,7 +361,7 @@ class Baker {
             if (kind_ == ControlKind::kAffine) {
                 for (size_t c = 0; c < channels_; ++c) {
                     const auto mean = static_cast<double>(meanOf(moments(i, c)));
-                    const auto gradient = fitGradient(moments(i, c).corners, mean, size_);
+                    const auto gradient = fitGradient(corners_[i * channels_ + c], mean, size_);
                     baked_.shapes.insert(baked_.shapes.end(), gradient.begin(), gradient.end());
                 }
                 itemOf[i] |= isHomogeneous(i) ? 0 : SparseTable::kSingleFlag;
@@ -354,39 +370,15 @@ class Baker {
         baked_.table = plan_.mapped([&](Entry entry) { return itemOf[SparseTable::index(entry)]; });
     }
 
-    Int3 cellOf(const Int3& local) const {
-        return {{local[0] >> shift_, local[1] >> shift_, local[2] >> shift_}};
-    }
-    /// The job of the super-voxel at a place, or nothing where it is empty.
-    std::optional<size_t> jobAt(const Int3& cell) const {
-        const Entry entry =
-            plan_.find(cell[0] << shift_, cell[1] << shift_, cell[2] << shift_).entry;
-        return entry == SparseTable::kEmpty ? std::nullopt
-                                            : std::optional<size_t>(SparseTable::index(entry));
-    }
-
-    /// Corner values over all super-voxels together. A homogeneous super-voxel, empty ones
-    /// included, keeps its value at its corners: it is never given a residual.
+    /// Corner values over all super-voxels together.
     void fitCorners() {
-        std::vector<Int3> cells;  // those that are not homogeneous, by their place
-        std::vector<size_t> jobOf;
-        plan_.forEach([&](const Int3& lo, int shift, Entry entry) {
-            const size_t job = SparseTable::index(entry);
-            if (shift == shift_ && !isHomogeneous(job)) {
-                cells.push_back(cellOf(lo));
-                jobOf.push_back(job);
-            }
-        });
-        std::vector<std::vector<std::array<float, 8>>> corners(channels_);
+        std::vector<CornerFit> fits;
         for (size_t c = 0; c < channels_; ++c) {
-            corners[c] = fitChannel(cells, jobOf, c);
+            fits.push_back(fitChannel(c));
         }
-        std::unordered_map<Int3, size_t, PlaceHash> cellAt;
-        for (size_t i = 0; i < cells.size(); ++i) {
-            cellAt.emplace(cells[i], i);
-        }
-        std::map<std::vector<float>, Entry> known;  // job and corners, as floats hold them
-        const auto itemFor = [&](size_t job, const std::vector<float>& shape) {
+        std::map<std::vector<float>, Entry> known;  // corners, and the job's index in two halves
+        std::vector<float> shape(8 * channels_);
+        const auto itemFor = [&](size_t job) {
             std::vector<float> key = shape;
             key.push_back(static_cast<float>(job >> 16));
             key.push_back(static_cast<float>(job & 0xffff));
@@ -398,7 +390,6 @@ class Baker {
             }
             return it->second;
         };
-        std::vector<float> shape(8 * channels_);
         baked_.table = SparseTable(shift_, field_.box());
         baked_.table.fill(
             [&](const Int3& origin, int shift) -> std::optional<Entry> {
@@ -406,73 +397,70 @@ class Baker {
                 if (!entry) {
                     return std::nullopt;
                 }
-                if (*entry == SparseTable::kEmpty) {
+                if (*entry == SparseTable::kEmpty || isEmpty(SparseTable::index(*entry))) {
                     return SparseTable::kEmpty;
                 }
                 const size_t job = SparseTable::index(*entry);
-                if (isEmpty(job)) {
-                    return SparseTable::kEmpty;
-                }
-                if (isHomogeneous(job)) {
-                    for (size_t i = 0; i < shape.size(); ++i) {
-                        shape[i] = moments(job, i / 8).min;
-                    }
-                    return itemFor(job, shape);
-                }
-                if (shift > shift_) {
+                const bool homogeneous = isHomogeneous(job);
+                if (!homogeneous && shift > shift_) {
                     return std::nullopt;
                 }
-                const size_t cell = cellAt.at(cellOf(origin));
                 for (size_t i = 0; i < shape.size(); ++i) {
-                    shape[i] = corners[i / 8][cell][i % 8];
+                    shape[i] = homogeneous
+                                   ? moments(job, i / 8).min
+                                   : cornerValue(fits[i / 8], cornerOf(origin, i % 8), i / 8);
                 }
-                return itemFor(job, shape) | SparseTable::kSingleFlag;
+                return itemFor(job) | (homogeneous ? 0 : SparseTable::kSingleFlag);
             },
             [](const Int3&) { return SparseTable::kEmpty; });  // an item is always uniform
     }
 
-    struct PlaceHash {
-        size_t operator()(const Int3& p) const { return trk::hashWords(p.data(), p.size(), 0); }
-    };
-
-    std::vector<std::array<float, 8>> fitChannel(const std::vector<Int3>& cells,
-                                                 const std::vector<size_t>& jobOf,
-                                                 size_t channel) const {
-        std::vector<CornerFit::Cell> fitted;
-        std::vector<CornerFit::Fixed> fixed;
-        for (size_t i = 0; i < cells.size(); ++i) {
-            fitted.push_back({cells[i], &moments(jobOf[i], channel).corners});
-            for (int64_t n = 0; n < 27; ++n) {
-                const Int3 step{{n / 9 - 1, n / 3 % 3 - 1, n % 3 - 1}};
-                const auto job = jobAt(
-                    {{cells[i][0] + step[0], cells[i][1] + step[1], cells[i][2] + step[2]}});
-                if (!job || moments(*job, channel).min == moments(*job, channel).max) {
-                    addShared(cells[i], step, job ? moments(*job, channel).min : 0, fixed);
-                }
-            }
-        }
-        const CornerFit fit(fitted, fixed, size_);
-        std::vector<std::array<float, 8>> result;
-        for (size_t i = 0; i < cells.size(); ++i) {
-            result.push_back(fit.corners(i));
-        }
-        return result;
+    /// A corner of the super-voxel at `origin`, counted in super-voxels.
+    Int3 cornerOf(const Int3& origin, size_t corner) const {
+        return {{(origin[0] >> shift_) + static_cast<int64_t>(corner >> 2),
+                 (origin[1] >> shift_) + static_cast<int64_t>(corner >> 1 & 1),
+                 (origin[2] >> shift_) + static_cast<int64_t>(corner & 1)}};
     }
 
-    /// The corners that a cell has in common with its neighbour one step away.
-    static void addShared(const Int3& cell, const Int3& step, float value,
-                          std::vector<CornerFit::Fixed>& fixed) {
-        for (int64_t corner = 0; corner < 8; ++corner) {
-            const Int3 bits{{corner >> 2, corner >> 1 & 1, corner & 1}};
-            bool shared = true;
-            for (size_t a = 0; a < 3; ++a) {
-                shared = shared && (step[a] == 0 || (step[a] > 0) == (bits[a] > 0));
+    float cornerValue(const CornerFit& fit, const Int3& corner, size_t channel) const {
+        const std::optional<float> given = givenCorner(corner, channel);
+        return given ? *given : fit.value(corner);
+    }
+
+    /// The value of a corner that touches a homogeneous super-voxel (empty ones included): the
+    /// density there, lest that super-voxel be given a residual. Nothing for a corner to be fitted.
+    std::optional<float> givenCorner(const Int3& corner, size_t channel) const {
+        for (int64_t cell = 0; cell < 8; ++cell) {
+            const Int3 at{{(corner[0] - (cell >> 2)) * size_, (corner[1] - (cell >> 1 & 1)) * size_,
+                           (corner[2] - (cell & 1)) * size_}};
+            const Entry entry = plan_.find(at[0], at[1], at[2]).entry;
+            if (entry == SparseTable::kEmpty) {
+                return 0.0f;
             }
-            if (shared) {
-                fixed.push_back(
-                    {{{cell[0] + bits[0], cell[1] + bits[1], cell[2] + bits[2]}}, value});
+            const Moments& m = moments(SparseTable::index(entry), channel);
+            if (m.min == m.max) {
+                return m.min;
             }
         }
+        return std::nullopt;
+    }
+
+    /// Only super-voxels with a corner to be fitted take part.
+    CornerFit fitChannel(size_t channel) const {
+        std::vector<CornerFit::Cell> cells;
+        plan_.forEach([&](const Int3& lo, int shift, Entry entry) {
+            const size_t job = SparseTable::index(entry);
+            const Moments& m = moments(job, channel);
+            bool fitted = false;
+            for (size_t k = 0; k < 8 && shift == shift_ && m.min < m.max && !fitted; ++k) {
+                fitted = !givenCorner(cornerOf(lo, k), channel);
+            }
+            if (fitted) {
+                cells.push_back({cornerOf(lo, 0), &corners_[job * channels_ + channel],
+                                 static_cast<double>(m.max)});
+            }
+        });
+        return {cells, [&](const Int3& corner) { return givenCorner(corner, channel); }, size_};
     }
 
     static float meanOf(const Moments& m) {
@@ -490,22 +478,21 @@ class Baker {
             return;
         }
         const auto mean = static_cast<double>(v.mean);
-        const float reach = roundUp(
-            std::max(mean - static_cast<double>(m.min), static_cast<double>(m.max) - mean));
+        const float reach =
+            roundUp(std::max(mean - static_cast<double>(m.min), static_cast<double>(m.max) - mean));
         const double cells = std::pow(size_, 3);
         const double offset = mean - m.mean;  // the mean was rounded to float
         v.deviation = std::min(roundUp(std::sqrt(m.squares / cells + offset * offset)), reach);
         v.majorant = reach;
         v.rms = v.deviation;
         if (kind_ != ControlKind::kConstant) {
-            compareWithControl(jobs_[job], channel,
-                               baked_.control(item * channels_ + channel), v);
+            compareWithControl(jobs_[job], channel, baked_.control(item * channels_ + channel), v);
         }
     }
 
     /// Bound and RMS of what a control that is not constant leaves, vertex by vertex.
-    void compareWithControl(const Int3& origin, size_t channel,
-                            const ControlPolynomial<double>& control, BakedSuperVoxel& v) const {
+    void compareWithControl(const Int3& origin, size_t channel, const ControlPolynomial& control,
+                            BakedSuperVoxel& v) const {
         double majorant = 0;
         double squares = 0;
         const auto edge = static_cast<size_t>(cube_);
@@ -524,9 +511,8 @@ class Baker {
                             static_cast<size_t>(inBrick[2]) + z;
                         const float density = constant ? field_.constant(entry)[channel]
                                                        : field_.vertex(entry, vertex, channel);
-                        const double residual =
-                            static_cast<double>(density) -
-                            control.at({{unit(0, x), unit(1, y), unit(2, z)}});
+                        const double residual = static_cast<double>(density) -
+                                                control.at({{unit(0, x), unit(1, y), unit(2, z)}});
                         const double weight =
                             trapezoid(x, edge) * trapezoid(y, edge) * trapezoid(z, edge);
                         majorant = std::max(majorant, std::fabs(residual));
@@ -547,11 +533,13 @@ class Baker {
     int size_;
     int cube_;
     int shift_ = 0;
-    std::vector<Moments> cubes_;
+    std::vector<Moments> cubes_;              // of each brick's cubes and their channels
+    std::vector<CornerMoments> cubeCorners_;  // the same, where a fit asks for them
     SparseTable plan_;
-    std::vector<Int3> jobs_;         // origins, local
-    std::vector<Moments> moments_;   // of each job and channel
-    std::vector<size_t> itemJobs_;   // the job that each item of the bake is of
+    std::vector<Int3> jobs_;        // origins, local
+    std::vector<Moments> moments_;  // of each job and channel
+    std::vector<CornerMoments> corners_;
+    std::vector<size_t> itemJobs_;  // the job that each item of the bake is of
     BakedVolume baked_;
 };
 
@@ -620,16 +608,14 @@ BakedVolume bake(const ExtinctionField& field, const BakeOptions& options) {
     const size_t channels = baked.channels;
     for (int i = 0; i < options.levels; ++i) {
         if (i == 0) {
-            baked.levels.push_back(
-                nextLevel(baked.table, field.box(), channels, [&](size_t item, size_t c) {
-                    return baked.items[item * channels + c].mean;
-                }));
+            baked.levels.push_back(nextLevel(
+                baked.table, field.box(), channels,
+                [&](size_t item, size_t c) { return baked.items[item * channels + c].mean; }));
         } else {
             const ValueTable& finer = baked.levels.back();
-            baked.levels.push_back(
-                nextLevel(finer.table, field.box(), channels, [&](size_t item, size_t c) {
-                    return finer.values[item * channels + c];
-                }));
+            baked.levels.push_back(nextLevel(
+                finer.table, field.box(), channels,
+                [&](size_t item, size_t c) { return finer.values[item * channels + c]; }));
         }
     }
     return baked;

@@ -8,11 +8,22 @@
 
 #include <algorithm>
 #include <cmath>
-#include <utility>
+#include <functional>
+#include <numeric>
 
 namespace vdbtools {
 
 using trk::Int3;
+
+namespace {
+
+constexpr uint32_t kNoPart = 0xffffffffu;
+
+// Beside super-voxels whose corners are 0, a fit that keeps the mass must exceed the density: by
+// about a half where that is a plane. Beyond twice it, mass is better lost.
+constexpr double kOvershoot = 2;
+
+}  // namespace
 
 std::array<float, 3> fitGradient(const CornerMoments& moments, double mean, int size) {
     const double n = size;
@@ -56,46 +67,72 @@ size_t CornerFit::Hash::operator()(const Int3& p) const {
     return trk::hashWords(p.data(), p.size(), 0);
 }
 
-CornerFit::CornerFit(const std::vector<Cell>& cells, const std::vector<Fixed>& fixed, int size)
-    : size_(size) {
+CornerFit::CornerFit(const std::vector<Cell>& cells, const Given& given, int size) {
     for (int i = 0; i <= size; ++i) {
         const double hat = static_cast<double>(i) / size;
         const double weight = i == 0 || i == size ? 0.5 : 1;
         diagonal_ += weight * hat * hat / size;
         coupling_ += weight * hat * (1 - hat) / size;
     }
-    std::unordered_map<Int3, uint32_t, Hash> ids;
     cornersOf_.reserve(cells.size());
     for (const Cell& cell : cells) {
         std::array<uint32_t, 8> corners{};
         for (size_t k = 0; k < 8; ++k) {
             const auto bit = [k](int shift) { return static_cast<int64_t>(k >> shift & 1); };
             const Int3 at{{cell.at[0] + bit(2), cell.at[1] + bit(1), cell.at[2] + bit(0)}};
-            corners[k] = ids.try_emplace(at, static_cast<uint32_t>(ids.size())).first->second;
+            const auto [it, isNew] = ids_.try_emplace(at, static_cast<uint32_t>(ids_.size()));
+            if (isNew) {
+                const std::optional<float> value = given(at);
+                values_.push_back(value ? static_cast<double>(*value) : 0);
+                free_.push_back(value ? 0 : 1);
+                caps_.push_back(0);
+            }
+            corners[k] = it->second;
+            caps_[it->second] = std::max(caps_[it->second], kOvershoot * cell.max);
         }
-        const auto parity = static_cast<size_t>((cell.at[0] & 1) << 2 | (cell.at[1] & 1) << 1 |
-                                                (cell.at[2] & 1));
+        const auto parity =
+            static_cast<size_t>((cell.at[0] & 1) << 2 | (cell.at[1] & 1) << 1 | (cell.at[2] & 1));
         independent_[parity].push_back(static_cast<uint32_t>(cornersOf_.size()));
         cornersOf_.push_back(corners);
     }
-    values_.assign(ids.size(), 0);
-    free_.assign(ids.size(), 1);
-    for (const Fixed& f : fixed) {
-        const auto it = ids.find(f.corner);
-        if (it != ids.end()) {
-            values_[it->second] = static_cast<double>(f.value);
-            free_[it->second] = 0;
-        }
-    }
+    findParts();
     fit(cells);
 }
 
-std::array<float, 8> CornerFit::corners(size_t i) const {
-    std::array<float, 8> result{};
-    for (size_t k = 0; k < 8; ++k) {
-        result[k] = static_cast<float>(values_[cornersOf_[i][k]]);
+float CornerFit::value(const Int3& corner) const {
+    return static_cast<float>(values_[ids_.at(corner)]);
+}
+
+/// Cells that share free corners, directly or over others, are one part.
+void CornerFit::findParts() {
+    std::vector<uint32_t> leader(values_.size());
+    std::iota(leader.begin(), leader.end(), 0u);
+    const auto find = [&](uint32_t corner) {
+        while (leader[corner] != corner) {
+            corner = leader[corner] = leader[leader[corner]];
+        }
+        return corner;
+    };
+    constexpr uint32_t kNone = 0xffffffffu;
+    std::vector<uint32_t> anyFree(cornersOf_.size(), kNone);
+    for (size_t i = 0; i < cornersOf_.size(); ++i) {
+        for (const uint32_t corner : cornersOf_[i]) {
+            if (free_[corner]) {
+                anyFree[i] = anyFree[i] == kNone ? corner : anyFree[i];
+                leader[find(corner)] = find(anyFree[i]);
+            }
+        }
     }
-    return result;
+    std::vector<uint32_t> partOfLeader(values_.size(), kNoPart);
+    for (const uint32_t corner : anyFree) {
+        uint32_t part = kNoPart;
+        if (corner != kNone) {
+            uint32_t& known = partOfLeader[find(corner)];
+            known = known == kNoPart ? static_cast<uint32_t>(partCount_++) : known;
+            part = known;
+        }
+        partOf_.push_back(part);
+    }
 }
 
 /// The Gram matrix of all corners' hat functions times x: in each cell, a product of three
@@ -103,37 +140,37 @@ std::array<float, 8> CornerFit::corners(size_t i) const {
 void CornerFit::multiply(const std::vector<double>& x, std::vector<double>& result) const {
     std::fill(result.begin(), result.end(), 0.0);
     for (const std::vector<uint32_t>& cells : independent_) {
-        tbb::parallel_for(
-            tbb::blocked_range<size_t>(0, cells.size(), 1024),
-            [&](const tbb::blocked_range<size_t>& range) {
-                for (size_t i = range.begin(); i != range.end(); ++i) {
-                    const std::array<uint32_t, 8>& corners = cornersOf_[cells[i]];
-                    double v[8];
-                    for (size_t k = 0; k < 8; ++k) {
-                        v[k] = x[corners[k]];
-                    }
-                    for (const size_t stride : {4u, 2u, 1u}) {
-                        for (size_t k = 0; k < 8; ++k) {
-                            if ((k & stride) == 0) {
-                                const double a = v[k];
-                                const double b = v[k + stride];
-                                v[k] = diagonal_ * a + coupling_ * b;
-                                v[k + stride] = coupling_ * a + diagonal_ * b;
-                            }
-                        }
-                    }
-                    for (size_t k = 0; k < 8; ++k) {
-                        result[corners[k]] += v[k];
-                    }
-                }
-            });
+        tbb::parallel_for(tbb::blocked_range<size_t>(0, cells.size(), 1024),
+                          [&](const tbb::blocked_range<size_t>& range) {
+                              for (size_t i = range.begin(); i != range.end(); ++i) {
+                                  const std::array<uint32_t, 8>& corners = cornersOf_[cells[i]];
+                                  double v[8];
+                                  for (size_t k = 0; k < 8; ++k) {
+                                      v[k] = x[corners[k]];
+                                  }
+                                  for (const size_t stride : {4u, 2u, 1u}) {
+                                      for (size_t k = 0; k < 8; ++k) {
+                                          if ((k & stride) == 0) {
+                                              const double a = v[k];
+                                              const double b = v[k + stride];
+                                              v[k] = diagonal_ * a + coupling_ * b;
+                                              v[k + stride] = coupling_ * a + diagonal_ * b;
+                                          }
+                                      }
+                                  }
+                                  for (size_t k = 0; k < 8; ++k) {
+                                      result[corners[k]] += v[k];
+                                  }
+                              }
+                          });
     }
 }
 
-/// Conjugate gradients on the free corners, from x on; the condition number is about 27.
+/// Conjugate gradients on the free corners, from x on. Each has eight cells around it, unless a
+/// test says otherwise: the condition number is then at most 27.
 void CornerFit::solve(const std::vector<double>& right, std::vector<double>& x) const {
     constexpr int kMaxSteps = 200;
-    constexpr double kTolerance = 1e-13;
+    constexpr double kTolerance = 1e-11;  // values end as floats
     const size_t n = x.size();
     const auto dot = [&](const std::vector<double>& a, const std::vector<double>& b) {
         double sum = 0;
@@ -179,52 +216,63 @@ void CornerFit::fit(const std::vector<Cell>& cells) {
             mass[i] += (*cells[i].moments)[k];
         }
     }
-    // Corners that the fit would make negative are held at 0, and the others fitted again.
+    // Corners that come out beyond their limits are held at them, and the others fitted again.
     constexpr int kMaxRounds = 12;
     for (int round = 0; round < kMaxRounds; ++round) {
         solve(right, values_);
         keepMass(mass);
-        bool negative = false;
+        bool held = false;
         for (size_t i = 0; i < n; ++i) {
-            if (free_[i] && values_[i] < 0) {
-                values_[i] = 0;
+            const double limited = std::min(std::max(values_[i], 0.0), caps_[i]);
+            if (free_[i] && values_[i] != limited) {
+                values_[i] = limited;
                 free_[i] = 0;
-                negative = true;
+                held = true;
             }
         }
-        if (!negative) {
+        if (!held) {
             break;
         }
     }
 }
 
 /// Least squares alone would add mass: beside empty super-voxels, where corners are 0, the next
-/// ones overshoot. The whole mass is corrected there, where single super-voxels' masses are off,
-/// and not in parts that fit.
+/// ones overshoot. Each part's mass is corrected where single super-voxels' masses are off, and not
+/// where the fit is good.
 void CornerFit::keepMass(const std::vector<double>& mass) {
     const size_t n = values_.size();
     std::vector<double> weight(n, 0);
-    std::vector<double> share(n, 0);  // of a super-voxel's mass, per density at the corner
-    double excess = 0;
+    std::vector<double> excess(partCount_, 0);
     for (size_t i = 0; i < mass.size(); ++i) {
+        if (partOf_[i] == kNoPart) {
+            continue;
+        }
         double fitted = 0;
         for (const uint32_t corner : cornersOf_[i]) {
             fitted += 0.125 * values_[corner];
         }
-        excess += fitted - mass[i];
+        excess[partOf_[i]] += fitted - mass[i];
         for (const uint32_t corner : cornersOf_[i]) {
             weight[corner] += std::fabs(fitted - mass[i]);
-            share[corner] += 0.125;
         }
     }
     std::vector<double> direction(n, 0);
     solve(weight, direction);
-    double response = 0;
-    for (size_t i = 0; i < n; ++i) {
-        response += free_[i] ? share[i] * direction[i] : 0;
+    std::vector<double> response(partCount_, 0);
+    std::vector<uint32_t> partOfCorner(n, kNoPart);
+    for (size_t i = 0; i < mass.size(); ++i) {
+        for (const uint32_t corner : cornersOf_[i]) {
+            if (free_[corner]) {
+                response[partOf_[i]] += 0.125 * direction[corner];
+                partOfCorner[corner] = partOf_[i];
+            }
+        }
     }
-    for (size_t i = 0; i < n && response > 0; ++i) {
-        values_[i] -= free_[i] ? excess / response * direction[i] : 0;
+    for (size_t i = 0; i < n; ++i) {
+        const uint32_t part = partOfCorner[i];
+        if (part != kNoPart && response[part] > 0) {
+            values_[i] -= excess[part] / response[part] * direction[i];
+        }
     }
 }
 

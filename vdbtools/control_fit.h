@@ -8,6 +8,8 @@
 #include <array>
 #include <cstddef>
 #include <cstdint>
+#include <functional>
+#include <optional>
 #include <unordered_map>
 #include <vector>
 
@@ -22,25 +24,27 @@ using CornerMoments = std::array<double, 8>;
 /// those with which the control is >= 0 everywhere in a super-voxel of `size` voxels.
 std::array<float, 3> fitGradient(const CornerMoments& moments, double mean, int size);
 
-/// Corner values of a continuous control over many super-voxels, >= 0, with the least squared
-/// residual that keeps the density's mass.
+/// Corner values of a continuous control over many super-voxels with the least squared residual,
+/// each between 0 and twice the largest density of the super-voxels that touch it, which keep
+/// the density's mass: that of every connected part of the fit by itself, as far as its corners
+/// allow.
 class CornerFit {
   public:
     struct Cell {
         trk::Int3 at;  ///< in super-voxels
         const CornerMoments* moments;
-    };
-    struct Fixed {
-        trk::Int3 corner;
-        float value;
+        double max;  ///< of the density
     };
 
-    /// `fixed`: corners of the cells whose values are given; the others are fitted, in parallel,
-    /// with the same bits for any number of threads. `size`: of the super-voxels, in voxels.
-    CornerFit(const std::vector<Cell>& cells, const std::vector<Fixed>& fixed, int size);
+    /// The value of a corner that is given, or nothing for one that is to be fitted.
+    using Given = std::function<std::optional<float>(const trk::Int3& corner)>;
 
-    /// The values at the corners of cell `i`, x slowest.
-    std::array<float, 8> corners(size_t i) const;
+    /// Fits in parallel, with the same bits for any number of threads. `given` is asked once for
+    /// each corner of the cells. `size`: of the super-voxels, in voxels.
+    CornerFit(const std::vector<Cell>& cells, const Given& given, int size);
+
+    /// The value of a corner of any of the cells.
+    float value(const trk::Int3& corner) const;
 
   private:
     struct Hash {
@@ -49,14 +53,18 @@ class CornerFit {
 
     void multiply(const std::vector<double>& x, std::vector<double>& result) const;
     void solve(const std::vector<double>& right, std::vector<double>& x) const;
+    void findParts();
     void fit(const std::vector<Cell>& cells);
     void keepMass(const std::vector<double>& mass);
 
-    int size_;
+    std::unordered_map<trk::Int3, uint32_t, Hash> ids_;  // of corners
     std::vector<std::array<uint32_t, 8>> cornersOf_;     // of each cell
     std::array<std::vector<uint32_t>, 8> independent_;   // cells of which no two share a corner
     std::vector<double> values_;                         // of each corner
     std::vector<char> free_;                             // whether its value is to be found
+    std::vector<double> caps_;                           // the largest it may have
+    std::vector<uint32_t> partOf_;  // of each cell; kNoPart without free corner
+    size_t partCount_ = 0;
     double diagonal_ = 0;  // of the one-dimensional Gram matrix of the two hat functions,
     double coupling_ = 0;  // and beside it
 };

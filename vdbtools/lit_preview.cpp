@@ -37,7 +37,6 @@ constexpr int kSkyDirections = 20;
 // In super-voxels. A place's own super-voxel is left out of its shadow: the light is tabulated
 // where the interpolated control is largest, and would show the grid of those places as dark dots.
 constexpr double kShadowStart = 1;
-constexpr float kNoLight = -1;  // of places where light is not tabulated
 
 Color skyRadiance(const Vec3d& direction) {
     const double height = direction[1];
@@ -79,6 +78,9 @@ const std::vector<Source>& sources() {
     return list;
 }
 
+// From a cell's first place to its corners, x slowest; as bricks have them.
+constexpr size_t kCellCorners[] = {0, 1, 9, 10, 81, 82, 90, 91};
+
 /// What is behind the volume, by the height in the picture: a sky that tells little of its own.
 Color backdrop(double y) {
     Color color;
@@ -118,11 +120,11 @@ trk::Volume openLevel(const std::string& path, uint32_t level, float scale,
 LitPreview::LitPreview(const std::string& sidecarPath, uint32_t level, float scale,
                        const std::array<float, 3>& color)
     : volume_(openLevel(sidecarPath, level, scale, color)) {
-    computeLight();
+    tabulateLight();
 }
 
 /// All light that arrives at a place, through what of the volume is in its way.
-LitPreview::Light LitPreview::lightAt(const Vec3d& local) const {
+LitPreview::Light LitPreview::computeLight(const Vec3d& local) const {
     Vec3d index = local;
     for (int a = 0; a < 3; ++a) {
         index[a] += static_cast<double>(volume_.anchor[static_cast<size_t>(a)]);
@@ -159,65 +161,101 @@ LitPreview::Light LitPreview::lightAt(const Vec3d& local) const {
     return light;
 }
 
-/// Tabulates the light at the corners of every cell that holds anything.
-void LitPreview::computeLight() {
-    constexpr size_t kEdge = ExtinctionField::kBrickEdge;
-    constexpr size_t kVertices = ExtinctionField::kBrickVertices;
+/// Tabulates the light at the corners of a brick's cells, of those that hold anything, and as
+/// finely in large constant regions as their size allows.
+void LitPreview::tabulateLight() {
     const ExtinctionField& field = volume_.field;
-    // A table like the field's, but bricks that stand in several places are lit apart.
-    std::vector<Int3> bricks;
-    SparseTable table(ExtinctionField::kBrickShift, field.box());
-    table.fill(
+    struct Region {
+        Int3 lo;
+        int shift;
+        SparseTable::Entry entry;  // the field's
+    };
+    std::vector<Region> regions;
+    const auto add = [&](const Int3& origin, int shift, SparseTable::Entry entry) {
+        regions.push_back({origin, shift, entry});
+        return static_cast<SparseTable::Entry>(regions.size());
+    };
+    regions_ = SparseTable(ExtinctionField::kBrickShift, field.box());
+    regions_.fill(
         [&](const Int3& origin, int shift) -> std::optional<SparseTable::Entry> {
             const auto found = field.table().find(origin[0], origin[1], origin[2]);
             if (found.shift < shift || !ExtinctionField::isConstant(found.entry)) {
                 return std::nullopt;
             }
             return found.entry == SparseTable::kEmpty ? SparseTable::kEmpty
-                                                      : ExtinctionField::kConstantFlag;
+                                                      : add(origin, shift, found.entry);
         },
         [&](const Int3& origin) {
-            bricks.push_back(origin);
-            return static_cast<SparseTable::Entry>(bricks.size());
+            const auto found = field.table().find(origin[0], origin[1], origin[2]);
+            return add(origin, ExtinctionField::kBrickShift, found.entry);
         });
-    std::vector<size_t> needed;  // vertices of all bricks, counted through
-    for (size_t b = 0; b < bricks.size(); ++b) {
-        const Int3& lo = bricks[b];
-        const SparseTable::Entry entry = field.table().find(lo[0], lo[1], lo[2]).entry;
-        std::array<char, kVertices> marks{};
+    std::vector<size_t> needed;  // places of all regions, counted through
+    for (size_t r = 0; r < regions.size(); ++r) {
+        const SparseTable::Entry entry = regions[r].entry;
+        std::array<char, kPlaces> marks{};
         for (size_t cell = 0; cell < 512; ++cell) {
             const size_t first = ((cell >> 6) * kEdge + (cell >> 3 & 7)) * kEdge + (cell & 7);
-            constexpr size_t kCorners[] = {0, 1, 9, 10, 81, 82, 90, 91};
-            bool occupied = false;
-            for (const size_t corner : kCorners) {
-                for (size_t c = 0; c < field.channels(); ++c) {
-                    occupied = occupied || field.vertex(entry, first + corner, c) > 0;
+            bool occupied = ExtinctionField::isConstant(entry);
+            for (const size_t corner : kCellCorners) {
+                for (size_t c = 0; c < field.channels() && !occupied; ++c) {
+                    occupied = field.vertex(entry, first + corner, c) > 0;
                 }
             }
-            for (const size_t corner : kCorners) {
+            for (const size_t corner : kCellCorners) {
                 marks[first + corner] = occupied ? 1 : marks[first + corner];
             }
         }
-        for (size_t i = 0; i < kVertices; ++i) {
+        for (size_t i = 0; i < kPlaces; ++i) {
             if (marks[i]) {
-                needed.push_back(b * kVertices + i);
+                needed.push_back(r * kPlaces + i);
             }
         }
     }
-    std::vector<float> light(bricks.size() * kVertices * 3, 0.0f);
+    light_.resize(regions.size() * kPlaces);
     tbb::parallel_for(tbb::blocked_range<size_t>(0, needed.size(), 16), [&](const auto& range) {
         for (size_t n = range.begin(); n != range.end(); ++n) {
-            const Int3& lo = bricks[needed[n] / kVertices];
-            const size_t i = needed[n] % kVertices;
-            const Light value =
-                lightAt({{static_cast<double>(lo[0]) + static_cast<double>(i / 81),
-                          static_cast<double>(lo[1]) + static_cast<double>(i / 9 % 9),
-                          static_cast<double>(lo[2]) + static_cast<double>(i % 9)}});
-            std::copy(value.begin(), value.end(), &light[needed[n] * 3]);
+            const Region& region = regions[needed[n] / kPlaces];
+            const size_t i = needed[n] % kPlaces;
+            const double spacing = std::ldexp(1.0, region.shift - 3);
+            const double step[3] = {static_cast<double>(i / (kEdge * kEdge)),
+                                    static_cast<double>(i / kEdge % kEdge),
+                                    static_cast<double>(i % kEdge)};
+            Vec3d place;
+            for (int a = 0; a < 3; ++a) {
+                place[a] =
+                    static_cast<double>(region.lo[static_cast<size_t>(a)]) + spacing * step[a];
+            }
+            light_[needed[n]] = computeLight(place);
         }
     });
-    light_ =
-        ExtinctionField(3, std::move(table), std::vector<float>(3, kNoLight), std::move(light), {});
+}
+
+/// The tabulated light, interpolated.
+LitPreview::Light LitPreview::lightAt(const Vec3d& local) const {
+    const Int3 at{{static_cast<int64_t>(local[0]), static_cast<int64_t>(local[1]),
+                   static_cast<int64_t>(local[2])}};
+    const auto [entry, shift] = regions_.find(at[0], at[1], at[2]);
+    if (entry == SparseTable::kEmpty) {
+        return {};
+    }
+    size_t first = SparseTable::index(entry) * kPlaces;
+    float weight[3][2];
+    for (int a = 0; a < 3; ++a) {
+        const int64_t lo = at[static_cast<size_t>(a)] >> shift << shift;
+        const double x = std::ldexp(local[a] - static_cast<double>(lo), 3 - shift);
+        const auto cell = std::min(static_cast<size_t>(std::max(x, 0.0)), kEdge - 2);
+        first += cell * (a == 0 ? kEdge * kEdge : a == 1 ? kEdge : 1);
+        weight[a][1] = static_cast<float>(x - static_cast<double>(cell));
+        weight[a][0] = 1 - weight[a][1];
+    }
+    Light light{};
+    for (size_t corner = 0; corner < 8; ++corner) {
+        const float w = weight[0][corner >> 2] * weight[1][corner >> 1 & 1] * weight[2][corner & 1];
+        for (size_t k = 0; k < 3; ++k) {
+            light[k] += w * light_[first + kCellCorners[corner]][k];
+        }
+    }
+    return light;
 }
 
 void LitPreview::drawPixel(const TrkRay& ray, Picture& picture, size_t pixel) const {
@@ -241,36 +279,47 @@ void LitPreview::drawPixel(const TrkRay& ray, Picture& picture, size_t pixel) co
                          static_cast<double>(ray.origin[2])}};
         const double start = length(volume_.indexToWorld.point(entry) - eye);
         const auto mean = [](const Color& c) { return (c[0] + c[1] + c[2]) / 3; };
+        // One stretch in which light counts as constant.
+        const auto addStretch = [&](double t0, double t1, const auto& passed) {
+            const Light light = lightAt(local.at(0.5 * (t0 + t1)));
+            const double before = mean(transmittance);
+            for (size_t k = 0; k < 3; ++k) {
+                const double p = passed[k % V::kChannels];
+                radiance[k] += transmittance[k] * (1 - p) * static_cast<double>(light[k]);
+                transmittance[k] *= p;
+            }
+            const double after = mean(transmittance);
+            if (before > 0.5 && after <= 0.5) {
+                const double within = std::log(before / 0.5) / std::log(before / after);
+                halfDepth = start + lengthPerVoxel * (t0 + within * (t1 - t0));
+            }
+        };
         volume_.field.forEachCell<V::kDensityChannels>(
-            local, 0, local.tEnd, [&](double t0, double t1, const auto& depth) {
-                // Large constant regions in pieces of a voxel, as light varies in them.
-                const int pieces = std::max(1, static_cast<int>(std::ceil(t1 - t0 - 1)));
-                const double unit = lengthPerVoxel / pieces;
-                std::array<double, V::kChannels> passed;
-                double least = 1;
+            local, 0, local.tEnd, [&](double t0, double t1, const auto& integral) {
+                std::array<double, V::kChannels> depth;
+                double most = 0;
                 for (size_t c = 0; c < V::kChannels; ++c) {
-                    passed[c] =
-                        std::exp(-unit * volume_.scales[c] * depth[c % V::kDensityChannels]);
-                    least = std::min(least, passed[c]);
+                    depth[c] =
+                        lengthPerVoxel * volume_.scales[c] * integral[c % V::kDensityChannels];
+                    most = std::max(most, depth[c]);
                 }
-                for (int i = 0; least < 1 && i < pieces; ++i) {
-                    const double t = t0 + (t1 - t0) * (i + 0.5) / pieces;
-                    Light light = light_.density<3>(local.at(t));
-                    if (light[0] == kNoLight) {
-                        light = lightAt(local.at(t));
+                if (most == 0) {
+                    return true;
+                }
+                // A large constant region in stretches that absorb alike.
+                constexpr double kMaxStretches = 24;
+                const auto count = static_cast<int>(
+                    std::min(std::max(std::ceil(t1 - t0 - 1), 1.0), kMaxStretches));
+                double from = 0;  // shares of the region
+                for (int i = 1; i <= count; ++i) {
+                    const double absorbed = -std::expm1(-most) * i / count;
+                    const double to = i == count ? 1.0 : -std::log1p(-absorbed) / most;
+                    std::array<double, V::kChannels> passed;
+                    for (size_t c = 0; c < V::kChannels; ++c) {
+                        passed[c] = std::exp(-depth[c] * (to - from));
                     }
-                    const double before = mean(transmittance);
-                    for (size_t k = 0; k < 3; ++k) {
-                        const double p = passed[k % V::kChannels];
-                        radiance[k] += transmittance[k] * (1 - p) * static_cast<double>(light[k]);
-                        transmittance[k] *= p;
-                    }
-                    const double after = mean(transmittance);
-                    if (before > 0.5 && after <= 0.5) {
-                        const double within = std::log(before / 0.5) / std::log(before / after);
-                        halfDepth =
-                            start + lengthPerVoxel * (t + (within - 0.5) * (t1 - t0) / pieces);
-                    }
+                    addStretch(t0 + from * (t1 - t0), t0 + to * (t1 - t0), passed);
+                    from = to;
                 }
                 return std::max({transmittance[0], transmittance[1], transmittance[2]}) > kOpaque;
             });

@@ -3,7 +3,7 @@
 #pragma once
 
 #include "camera.h"
-#include "extinction_field.h"
+#include "sparse_table.h"
 #include "volume.h"
 
 #include <array>
@@ -41,17 +41,23 @@ class LitPreview {
     Picture draw(const Camera& camera, int width, int height,
                  const std::function<void(double)>& progress) const;
 
-    size_t bytes() const { return volume_.bytes() + light_.bytes(); }
+    size_t bytes() const {
+        return volume_.bytes() + regions_.bytes() + light_.capacity() * sizeof(Light);
+    }
 
   private:
     using Light = std::array<float, 3>;
+    static constexpr size_t kEdge = 9;  // places a region's edge at which light is tabulated
+    static constexpr size_t kPlaces = kEdge * kEdge * kEdge;
 
+    Light computeLight(const trk::Vec3d& local) const;
     Light lightAt(const trk::Vec3d& local) const;
-    void computeLight();
+    void tabulateLight();
     void drawPixel(const TrkRay& ray, Picture& picture, size_t pixel) const;
 
-    trk::Volume volume_;          // the interpolated control, as if it were a density
-    trk::ExtinctionField light_;  // what arrives, in three channels
+    trk::Volume volume_;        // the interpolated control, as if it were a density
+    trk::SparseTable regions_;  // the field's bricks and constant regions, each its own item
+    std::vector<Light> light_;  // what arrives at the places of each region, x slowest
 };
 
 }  // namespace vdbtools

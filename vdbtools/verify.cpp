@@ -82,18 +82,9 @@ class Verifier {
 
     static constexpr size_t kChannels = std::tuple_size_v<Sample>;
 
-    bool isHomogeneous(size_t item) const {
-        bool homogeneous = true;
-        for (size_t c = 0; c < kChannels; ++c) {
-            const BakedSuperVoxel& v = sidecar_.baked.items[item + c];
-            homogeneous = homogeneous && v.min == v.max;
-        }
-        return homogeneous;
-    }
-
     /// A region of equal super-voxels is one place if they claim to be constant, else one each.
     void addPlaces(const Int3& origin, int shift, size_t item, std::vector<Place>& places) const {
-        if (isHomogeneous(item) || shift == sidecar_.baked.superVoxelShift) {
+        if (sidecar_.baked.isHomogeneous(item) || shift == sidecar_.baked.superVoxelShift) {
             places.push_back({origin, shift, item});
             return;
         }
@@ -178,8 +169,8 @@ class Verifier {
         return static_cast<double>(x) / static_cast<double>(size_) - 0.5;
     }
 
-    std::array<trk::ControlPolynomial<double>, kChannels> controlsOf(const Place& place) const {
-        std::array<trk::ControlPolynomial<double>, kChannels> controls;
+    std::array<trk::ControlPolynomial, kChannels> controlsOf(const Place& place) const {
+        std::array<trk::ControlPolynomial, kChannels> controls;
         for (size_t c = 0; c < kChannels; ++c) {
             controls[c] = sidecar_.baked.control(place.item + c);
         }
@@ -223,8 +214,7 @@ class Verifier {
                               ++vertices;
                               for (size_t c = 0; c < kChannels && wrong.empty(); ++c) {
                                   // Homogeneous: its control is its centre's everywhere.
-                                  wrong =
-                                      checkVertex(place, c, at, sample[c], controls[c].centre);
+                                  wrong = checkVertex(place, c, at, sample[c], controls[c].centre);
                               }
                               return wrong.empty();
                           });

@@ -4,6 +4,7 @@
 
 #include "math.h"
 
+#include <algorithm>
 #include <array>
 #include <cstddef>
 #include <string>
@@ -57,55 +58,49 @@ double evaluateSlope(const Real* s, const Vec3d& u) {
 }
 
 /// A control of any kind as a polynomial in u.
-template <class Real>
 struct ControlPolynomial {
-    Real centre = 0;
-    std::array<Real, 7> slope{};
+    double centre = 0;
+    std::array<double, 7> slope{};
 
     double at(const Vec3d& u) const {
-        return static_cast<double>(centre) +
-               evaluateSlope<ControlKind::kTrilinear>(slope.data(), u);
+        return centre + evaluateSlope<ControlKind::kTrilinear>(slope.data(), u);
     }
     /// The largest value at a corner, and anywhere in the super-voxel.
     double max() const {
         double result = at({{-0.5, -0.5, -0.5}});
         for (int corner = 1; corner < 8; ++corner) {
-            result = std::max(result, at({{corner & 4 ? 0.5 : -0.5, corner & 2 ? 0.5 : -0.5,
-                                           corner & 1 ? 0.5 : -0.5}}));
+            result = std::max(
+                result,
+                at({{corner & 4 ? 0.5 : -0.5, corner & 2 ? 0.5 : -0.5, corner & 1 ? 0.5 : -0.5}}));
         }
         return result;
     }
-    bool isConstant() const { return slope == std::array<Real, 7>{}; }
 };
 
 /// The control that a bake's `mean` and `shape` stand for, in super-voxels of `size` voxels.
-inline ControlPolynomial<double> controlPolynomial(ControlKind kind, float mean, const float* shape,
-                                                   int size) {
-    ControlPolynomial<double> p;
+inline ControlPolynomial controlPolynomial(ControlKind kind, float mean, const float* shape,
+                                           int size) {
+    ControlPolynomial p;
     p.centre = static_cast<double>(mean);
     if (kind == ControlKind::kAffine) {
         for (size_t a = 0; a < 3; ++a) {
             p.slope[a] = static_cast<double>(shape[a]) * size;
         }
     } else if (kind == ControlKind::kTrilinear) {
-        // Each coefficient is a mean of signed corners: a product of differences along its axes and
-        // averages along the others.
-        constexpr int kAxes[8] = {0, 4, 2, 1, 6, 5, 3, 7};  // bit 4 stands for x, 2 for y, 1 for z
-        for (size_t k = 0; k < 8; ++k) {
-            double sum = 0;
-            double scale = 0.125;
-            for (int corner = 0; corner < 8; ++corner) {
-                double sign = 1;
-                for (const int bit : {4, 2, 1}) {
-                    sign *= (kAxes[k] & bit) != 0 && (corner & bit) == 0 ? -1 : 1;
+        // Along each axis, pairs of corners become their average and their difference.
+        std::array<double, 8> v{};
+        std::copy(shape, shape + 8, v.begin());
+        for (const size_t stride : {4u, 2u, 1u}) {
+            for (size_t k = 0; k < 8; ++k) {
+                if ((k & stride) == 0) {
+                    const double lower = v[k];
+                    v[k] = 0.5 * (lower + v[k + stride]);
+                    v[k + stride] -= lower;
                 }
-                sum += sign * static_cast<double>(shape[corner]);
             }
-            for (const int bit : {4, 2, 1}) {
-                scale *= (kAxes[k] & bit) != 0 ? 2 : 1;
-            }
-            (k == 0 ? p.centre : p.slope[k - 1]) = sum * scale;
         }
+        p.centre = v[0];
+        p.slope = {{v[4], v[2], v[1], v[6], v[5], v[3], v[7]}};
     }
     return p;
 }

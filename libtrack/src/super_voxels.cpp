@@ -42,7 +42,9 @@ double SuperVoxels::chooseShare(TrkChoice choice, double min, double max, double
     if (choice == TRK_CHOICE_MEAN || range <= 0 || excess <= 0) {
         return 1;
     }
-    return std::min(1.0, allowedExcess(range, diagonal) / excess);
+    // Where collisions are rare the formula allows more than the range; a constant control never
+    // takes that, being the mean at most.
+    return std::min(1.0, std::min(allowedExcess(range, diagonal), range) / excess);
 }
 
 SuperVoxels::SuperVoxels(BakedVolume baked, const std::vector<double>& scales, TrkChoice choice,
@@ -57,7 +59,7 @@ SuperVoxels::SuperVoxels(BakedVolume baked, const std::vector<double>& scales, T
     shapes_.reserve(kind_ == ControlKind::kConstant ? 0 : count * (1 + slopeSize(kind_)));
     for (size_t i = 0; i < count; ++i) {
         const BakedSuperVoxel& item = baked.items[itemOf(i)];
-        const ControlPolynomial<double> control = baked.control(itemOf(i));
+        const ControlPolynomial control = baked.control(itemOf(i));
         const double s = scales[i % channels];
         const double min = s * static_cast<double>(item.min);
         const double max = s * static_cast<double>(item.max);
@@ -79,7 +81,9 @@ SuperVoxels::SuperVoxels(BakedVolume baked, const std::vector<double>& scales, T
             const double excess = std::min(majorant, s * control.max() - min);
             share = chooseShare(choice, min, max, excess, superDiagonal);
             v.control = static_cast<float>(min + share * (s * control.centre - min));
-            v.bound = roundUp(share * majorant + (1 - share) * (max - min));
+            // What is looked up, and the coefficients of the control, are floats.
+            const double rounding = 4e-7 * (max + s * control.max());
+            v.bound = roundUp(share * majorant + (1 - share) * (max - min) + rounding);
         }
         if (item.min != item.max && v.max == v.baked) {  // by chance; it says homogeneous
             v.max = std::nextafter(v.max, std::numeric_limits<float>::infinity());
@@ -88,15 +92,16 @@ SuperVoxels::SuperVoxels(BakedVolume baked, const std::vector<double>& scales, T
         if (kind_ != ControlKind::kConstant) {
             shapes_.push_back(static_cast<float>(share));
             for (size_t k = 0; k < slopeSize(kind_); ++k) {
-                shapes_.push_back(static_cast<float>(s * control.slope[k]));
+                const double slope = item.min == item.max ? 0 : s * control.slope[k];
+                shapes_.push_back(static_cast<float>(slope));
             }
         }
     }
     for (ValueTable& level : levels_) {
         std::vector<float> extinctions(level.values.size() / baked.channels * channels);
         for (size_t i = 0; i < extinctions.size(); ++i) {
-            extinctions[i] =
-                static_cast<float>(scales[i % channels] * static_cast<double>(level.values[itemOf(i)]));
+            extinctions[i] = static_cast<float>(scales[i % channels] *
+                                                static_cast<double>(level.values[itemOf(i)]));
         }
         level.values = std::move(extinctions);
     }

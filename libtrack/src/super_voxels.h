@@ -47,8 +47,14 @@ struct BakedVolume {
     int superVoxelSize() const { return 1 << superVoxelShift; }
     const float* shape(size_t item) const { return shapes.data() + item * shapeSize(kind); }
     /// The control of an item (a super-voxel and channel).
-    ControlPolynomial<double> control(size_t item) const {
+    ControlPolynomial control(size_t item) const {
         return controlPolynomial(kind, items[item].mean, shape(item), superVoxelSize());
+    }
+    /// Whether every channel of a super-voxel, whose first item is given, is the same everywhere.
+    bool isHomogeneous(size_t firstItem) const {
+        const auto first = items.begin() + static_cast<std::ptrdiff_t>(firstItem);
+        return std::all_of(first, first + static_cast<std::ptrdiff_t>(channels),
+                           [](const BakedSuperVoxel& v) { return v.min == v.max; });
     }
     float maxDensity() const {
         float max = 0;
@@ -83,7 +89,8 @@ class SuperVoxelView {
             return centre;
         } else {
             const float* shape = shapes_ + channel * kStride;
-            return centre + static_cast<double>(shape[0]) * slope(shape + 1, toUnit(point));
+            return centre +
+                   static_cast<double>(shape[0]) * evaluateSlope<K>(shape + 1, toUnit(point));
         }
     }
     /// Integral of the chosen control over [t0, t1] of the ray, in voxel lengths.
@@ -121,21 +128,18 @@ class SuperVoxelView {
         }
         return u;
     }
-    static double slope(const float* coefficients, const Vec3d& u) {
-        return evaluateSlope<K>(coefficients, u);
-    }
     /// An affine control is linear along a ray, a trilinear one cubic: one Gauss point is exact for
     /// the first, two for the second.
     double integrateSlope(const float* coefficients, const LocalRay& ray, double t0,
                           double t1) const {
         const double middle = 0.5 * (t0 + t1);
         if constexpr (K == ControlKind::kAffine) {
-            return slope(coefficients, toUnit(ray.at(middle))) * (t1 - t0);
+            return evaluateSlope<K>(coefficients, toUnit(ray.at(middle))) * (t1 - t0);
         } else {
             const double offset = 0.5 * (t1 - t0) * 0.57735026918962576451;  // 1/sqrt(3)
             return 0.5 * (t1 - t0) *
-                   (slope(coefficients, toUnit(ray.at(middle - offset))) +
-                    slope(coefficients, toUnit(ray.at(middle + offset))));
+                   (evaluateSlope<K>(coefficients, toUnit(ray.at(middle - offset))) +
+                    evaluateSlope<K>(coefficients, toUnit(ray.at(middle + offset))));
         }
     }
 
@@ -169,15 +173,15 @@ class SuperVoxels {
     template <size_t C, ControlKind K, class Visit>
     void walk(const LocalRay& ray, double t0, double t1, Visit&& visit) const {
         const double inverseSize = 1.0 / size();
-        table_.walk(ray, t0, t1,
-                    [&](SparseTable::Entry entry, const Int3& lo, int, double tEnter,
-                        double tExit) {
-                        const size_t item = SparseTable::index(entry) * C;
-                        using View = SuperVoxelView<C, K>;
-                        return visit(View(&items_[item], shapes_.data() + item * View::kStride, lo,
-                                          inverseSize),
-                                     tEnter, tExit);
-                    });
+        table_.walk(
+            ray, t0, t1,
+            [&](SparseTable::Entry entry, const Int3& lo, int, double tEnter, double tExit) {
+                const size_t item = SparseTable::index(entry) * C;
+                using View = SuperVoxelView<C, K>;
+                return visit(
+                    View(&items_[item], shapes_.data() + item * View::kStride, lo, inverseSize),
+                    tEnter, tExit);
+            });
     }
 
     /// Integral of the baked control extinction of a level over the ray, times the length of a

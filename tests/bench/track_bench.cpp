@@ -64,43 +64,59 @@ TrkQuery singleThreaded(TrkMethod method) {
     return query;
 }
 
-/// The volume with super-voxels of `size`, scaled to a mean optical depth of the rays that hit.
-Set& makeSet(int size, int depth, bool coherent) {
+/// What is measured: a volume with super-voxels of `size`, scaled to a mean optical depth of the
+/// rays that hit (in the first channel).
+struct Case {
+    int size = 16;
+    int depth = 1;
+    bool coherent = true;
+    std::string colour = "grey";  // "tinted": the same volume; "vectors": the coloured cloud
+    trk::ControlKind kind = trk::ControlKind::kConstant;
+
+    std::string label() const {
+        return "/size" + std::to_string(size) + "/depth" + std::to_string(depth) +
+               (coherent ? "/camera" : "/inside") + (colour == "grey" ? "" : "/" + colour) +
+               (kind == trk::ControlKind::kConstant ? "" : std::string("/") + controlName(kind));
+    }
+};
+
+Set& makeSet(const Case& c) {
     static std::map<std::string, Set> sets;
-    const std::string key =
-        std::to_string(size) + "-" + std::to_string(depth) + (coherent ? "c" : "i");
-    Set& set = sets[key];
+    Set& set = sets[c.label()];
     if (set.volume) {
         return set;
     }
-    const std::string vdb = volumeFile();
-    const std::string sidecar = fixtures::path("bench" + std::to_string(size) + ".track.vdb");
-    fixtures::bake(vdb, sidecar, size);
+    const std::string vdb =
+        c.colour == "vectors" ? fixtures::cloudFile(256, "color-cloud") : volumeFile();
+    const std::string sidecar = fixtures::path("bench.track.vdb");
+    fixtures::bake(vdb, sidecar, c.size, 2, c.kind);
     TrkVolumeOptions options = trkDefaultVolumeOptions();
+    options.color[1] = c.colour == "tinted" ? 0.5f : 1.0f;
     const track::Volume unscaled = track::Volume::open(vdb, "", options);
     const rays::Box box = rays::boundsOf(unscaled.info());
-    set.rays = coherent ? cameraRays(box) : rays::through(box, 16384, 0, 1);
+    set.rays = c.coherent ? cameraRays(box) : rays::through(box, 16384, 0, 1);
     const TrkQuery query = singleThreaded(TRK_METHOD_EXACT);
-    std::vector<double> depths(set.rays.size());
+    const size_t channels = unscaled.info().channels;
+    std::vector<double> depths(channels * set.rays.size());
     unscaled.integrateOpticalDepth(query, set.rays.data(), set.rays.size(), depths.data());
     double sum = 0;
     double hits = 0;
-    for (const double d : depths) {
-        sum += d;
-        hits += d > 0 ? 1 : 0;
+    for (size_t i = 0; i < depths.size(); i += channels) {
+        sum += depths[i];
+        hits += depths[i] > 0 ? 1 : 0;
     }
-    options.scale = static_cast<float>(depth * hits / sum);
+    options.scale = static_cast<float>(c.depth * hits / sum);
     set.volume =
         std::make_unique<track::Volume>(track::Volume::open(vdb, sidecar.c_str(), options));
-    set.exact.resize(set.rays.size());
+    set.exact.resize(channels * set.rays.size());
     set.volume->estimateTransmittance(query, set.rays.data(), set.rays.size(), set.exact.data());
     return set;
 }
 
-void estimate(benchmark::State& state, TrkMethod method, int size, int depth, bool coherent) {
-    Set& set = makeSet(size, depth, coherent);
+void estimate(benchmark::State& state, TrkMethod method, const Case& measured) {
+    Set& set = makeSet(measured);
     TrkQuery query = singleThreaded(method);
-    std::vector<float> out(set.rays.size());
+    std::vector<float> out(set.exact.size());
     std::vector<TrkStatistics> statistics(set.rays.size());
     double squares = 0;
     double lookups = 0;
@@ -112,7 +128,9 @@ void estimate(benchmark::State& state, TrkMethod method, int size, int depth, bo
         for (size_t i = 0; i < out.size(); ++i) {
             const double error = static_cast<double>(out[i]) - static_cast<double>(set.exact[i]);
             squares += error * error;
-            lookups += static_cast<double>(statistics[i].lookups);
+        }
+        for (const TrkStatistics& s : statistics) {
+            lookups += static_cast<double>(s.lookups);
         }
         state.ResumeTiming();
     }
@@ -120,7 +138,7 @@ void estimate(benchmark::State& state, TrkMethod method, int size, int depth, bo
     state.counters["s/ray"] =
         benchmark::Counter(rays, benchmark::Counter::kIsRate | benchmark::Counter::kInvert);
     state.counters["lookups"] = lookups / rays;
-    state.counters["mse"] = squares / rays;
+    state.counters["mse"] = squares / static_cast<double>(out.size() * state.iterations());
 }
 
 void bakeStatistics(benchmark::State& state) {
@@ -145,19 +163,26 @@ int main(int argc, char** argv) {
                                                          {"residual", TRK_METHOD_RESIDUAL},
                                                          {"ratio", TRK_METHOD_RATIO},
                                                          {"control", TRK_METHOD_CONTROL}};
+    std::vector<Case> cases;
     for (const bool coherent : {true, false}) {
         for (const int depth : {1, 10}) {
             for (const int size : {8, 16}) {
-                for (const auto& [name, method] : methods) {
-                    const std::string label = std::string(name) + "/size" + std::to_string(size) +
-                                              "/depth" + std::to_string(depth) +
-                                              (coherent ? "/camera" : "/inside");
-                    const TrkMethod m = method;
-                    benchmark::RegisterBenchmark(label.c_str(), [=](benchmark::State& state) {
-                        estimate(state, m, size, depth, coherent);
-                    })->Unit(benchmark::kMillisecond);
-                }
+                cases.push_back({size, depth, coherent});
             }
+        }
+    }
+    for (const char* colour : {"tinted", "vectors"}) {
+        cases.push_back({16, 1, true, colour});
+    }
+    for (const trk::ControlKind kind : {trk::ControlKind::kTrilinear, trk::ControlKind::kAffine}) {
+        cases.push_back({16, 1, true, "grey", kind});
+    }
+    for (const Case& c : cases) {
+        for (const auto& [name, method] : methods) {
+            const TrkMethod m = method;
+            benchmark::RegisterBenchmark((name + c.label()).c_str(), [=](benchmark::State& state) {
+                estimate(state, m, c);
+            })->Unit(benchmark::kMillisecond);
         }
     }
     benchmark::RegisterBenchmark("load", loadDensity)->Unit(benchmark::kMillisecond);

@@ -89,6 +89,7 @@ class FieldBuilder {
     using Regions = TreeRegions<TreeType>;
     using FieldValue = Sample<Value>;
     using Vertices = std::array<FieldValue, kBrickVertices>;
+    static_assert(sizeof(Vertices) == kBrickVertices * kChannels * sizeof(float));
     using CornerValues = std::array<FieldValue, 8>;
 
     struct Tile {
@@ -397,7 +398,7 @@ ExtinctionField FieldBuilder<TreeType>::build(const Int3& anchor, uint64_t maxMe
     size_t brickCount = 0;
     for (size_t i = 0; i < jobCount; ++i) {
         entryOf[i] = constantOf[i] == notConstant ? static_cast<Entry>(++brickCount)
-                                                   : plan.constantEntry(constantOf[i]);
+                                                  : plan.constantEntry(constantOf[i]);
     }
     const size_t valueCount = brickCount * kBrickVertices * kChannels;
     const uint64_t wanted = valueCount * (scan_.exactHalfs ? 2 : 4);
@@ -415,20 +416,20 @@ ExtinctionField FieldBuilder<TreeType>::build(const Int3& anchor, uint64_t maxMe
         if (constantOf[i] != notConstant) {
             return;
         }
-        size_t at = (entryOf[i] - 1) * kBrickVertices * kChannels;
-        for (const FieldValue& vertex : vertices) {
-            if (scan_.exactHalfs) {
-                std::transform(vertex.begin(), vertex.end(), &halfs[at], encodeHalf);
-            } else {
-                std::copy(vertex.begin(), vertex.end(), &floats[at]);
-            }
-            at += kChannels;
+        const float* from = vertices.front().data();
+        constexpr size_t kValues = kBrickVertices * kChannels;
+        const size_t to = (entryOf[i] - 1) * kValues;
+        if (scan_.exactHalfs) {
+            std::transform(from, from + kValues, &halfs[to], encodeHalf);
+        } else {
+            std::copy(from, from + kValues, &floats[to]);
         }
     });
     SparseTable table = plan.table.mapped([&](Entry entry) {
         return entry & ExtinctionField::kConstantFlag ? entry : entryOf[entry - 1];
     });
-    return {kChannels, std::move(table), std::move(plan.constants), std::move(floats), std::move(halfs)};
+    return {kChannels, std::move(table), std::move(plan.constants), std::move(floats),
+            std::move(halfs)};
 }
 
 }  // namespace trk

@@ -119,8 +119,8 @@ SidecarHeader readHeader(VdbFile& file) {
                         "trilinear fields");
     }
     if (channelCount(header.valueType) == 0) {
-        badSidecar(where, "is of type " + header.valueType +
-                              "; expected float, double, vec3s or vec3d");
+        badSidecar(where,
+                   "is of type " + header.valueType + "; expected float, double, vec3s or vec3d");
     }
     if (const auto meta = grid->getMetadata<openvdb::Int64Metadata>("track_dropped_nonfinite")) {
         header.repair |= TRK_REPAIR_DROP_NONFINITE;
@@ -217,11 +217,10 @@ class SidecarReader {
         tables_.clear();
         for (int level = 1; level <= header_.levels; ++level) {
             const int shift = shift_ + level;
-            const auto grid = readGrid(header_.valueType, levelSuffix(level), shift,
-                                       centreOffset(1 << shift));
+            const auto grid =
+                readGrid(header_.valueType, levelSuffix(level), shift, centreOffset(1 << shift));
             checkAnchor(supportBox(*grid, shift), sidecar.anchor, grid->getName());
-            baked.levels.push_back(
-                makeTable(*grid, shift, sidecar.anchor, Values::kNotNegative));
+            baked.levels.push_back(makeTable(*grid, shift, sidecar.anchor, Values::kNotNegative));
         }
     }
 
@@ -240,8 +239,7 @@ class SidecarReader {
     /// Reads a grid of one value per super-voxel; all of them cover one box.
     void readItems(const std::string& valueType, const std::string& suffix, Values values,
                    const Int3* anchor, Sidecar& sidecar) {
-        const auto grid =
-            readGrid(valueType, suffix, shift_, centreOffset(header_.superVoxelSize));
+        const auto grid = readGrid(valueType, suffix, shift_, centreOffset(header_.superVoxelSize));
         const IntBox support = supportBox(*grid, shift_);
         if (tables_.empty()) {
             box_ = support;
@@ -278,27 +276,25 @@ class SidecarReader {
                 }
                 const Int3 at = superVoxel(local, shift_, sidecar.anchor);
                 if (empty > 0) {
-                    badSidecar(file_.path(),
-                               "its grids are not active in the same super-voxels: see " +
-                                   where(at));
+                    badSidecar(
+                        file_.path(),
+                        "its grids are not active in the same super-voxels: see " + where(at));
                 }
-                const bool varies =
-                    baked.kind != ControlKind::kConstant && !isHomogeneous(entries);
+                const bool varies = baked.kind != ControlKind::kConstant && !isHomogeneous(entries);
                 if (varies && shift > shift_) {
                     return std::nullopt;
                 }
                 for (size_t corner = 0; varies && trilinear && corner < 8; ++corner) {
                     const int64_t size = header_.superVoxelSize;
-                    entries[tables_.size() + corner] =
-                        corners_.table
-                            .find(local[0] + (corner & 4 ? size : 0),
-                                  local[1] + (corner & 2 ? size : 0),
-                                  local[2] + (corner & 1 ? size : 0))
-                            .entry;
+                    entries[tables_.size() + corner] = corners_.table
+                                                           .find(local[0] + (corner & 4 ? size : 0),
+                                                                 local[1] + (corner & 2 ? size : 0),
+                                                                 local[2] + (corner & 1 ? size : 0))
+                                                           .entry;
                 }
-                const auto [it, isNew] = known.try_emplace(
-                    entries, static_cast<SparseTable::Entry>(known.size() + 1) |
-                                 (varies ? SparseTable::kSingleFlag : 0));
+                const auto [it, isNew] =
+                    known.try_emplace(entries, static_cast<SparseTable::Entry>(known.size() + 1) |
+                                                   (varies ? SparseTable::kSingleFlag : 0));
                 if (isNew) {
                     addItems(entries, varies, at, baked);
                 }
@@ -396,8 +392,7 @@ class SidecarReader {
         const VdbEntry& entry = findGrid(file_, name);
         const std::string place = file_.path() + ": grid " + name;
         if (entry.type != treeTypeName(valueType)) {
-            badSidecar(place,
-                       "is of type " + entry.type + "; expected " + treeTypeName(valueType));
+            badSidecar(place, "is of type " + entry.type + "; expected " + treeTypeName(valueType));
         }
         openvdb::GridBase::Ptr grid = file_.read(entry);
         checkFormat(*grid, place);
@@ -489,7 +484,7 @@ class SidecarReader {
             [](const Int3&) { return SparseTable::kEmpty; });  // a super-voxel is always uniform
     }
 
-    void checkItem(const BakedSuperVoxel& v, const ControlPolynomial<double>& control,
+    void checkItem(const BakedSuperVoxel& v, const ControlPolynomial& control,
                    const Int3& at) const {
         const double slack = 1 + 1e-6;
         const auto min = static_cast<double>(v.min);
@@ -500,8 +495,9 @@ class SidecarReader {
         const double majorant = static_cast<double>(v.majorant) * slack;
         const bool constant = header_.controlKind == ControlKind::kConstant;
         const char* wrong = nullptr;
-        if (v.rms > 0 && v.majorant == 0) {
-            wrong = "majorant 0 with an RMS above 0";
+        if ((v.rms > 0 || v.min < v.max) && v.majorant == 0) {
+            wrong =
+                v.rms > 0 ? "majorant 0 with an RMS above 0" : "majorant 0 with bounds that differ";
         } else if (v.min > v.max || mean * slack < min || mean > max * slack) {
             wrong = constant ? "a control that is not between min and max"
                              : "a mean that is not between min and max";

@@ -93,10 +93,10 @@ void fillCorners(GridType& grid, const BakedVolume& baked, const Int3& anchor) {
                 break;
             }
             if (!(value == openvdb::zeroVal<Value>())) {
-                accessor.setValueOn(at.offsetBy(static_cast<int>(corner >> 2),
-                                                static_cast<int>(corner >> 1 & 1),
-                                                static_cast<int>(corner & 1)),
-                                    value);
+                accessor.setValueOn(
+                    at.offsetBy(static_cast<int>(corner >> 2), static_cast<int>(corner >> 1 & 1),
+                                static_cast<int>(corner & 1)),
+                    value);
             }
         }
     });
@@ -138,11 +138,12 @@ void writeSidecar(const OutputFile& file, const SidecarHeader& header, const Bak
     openvdb::initialize();
     const size_t channels = baked.channels;
     const std::vector<Statistic> list = statistics(baked.kind);
-    const std::vector<std::string> gradients =
-        baked.kind == ControlKind::kAffine ? gradientSuffixes(channels) : std::vector<std::string>();
+    const std::vector<std::string> gradients = baked.kind == ControlKind::kAffine
+                                                   ? gradientSuffixes(channels)
+                                                   : std::vector<std::string>();
     const size_t corners = baked.kind == ControlKind::kTrilinear ? 1 : 0;
-    VdbWriter writer(file, static_cast<int32_t>(list.size() + gradients.size() + corners +
-                                                baked.levels.size()));
+    VdbWriter writer(
+        file, static_cast<int32_t>(list.size() + gradients.size() + corners + baked.levels.size()));
     const SidecarGrids grids{header, anchor};
     if (corners > 0) {
         writer.add(grids.make(header.valueType, kControlSuffix, baked.superVoxelSize(), 0,
@@ -158,8 +159,10 @@ void writeSidecar(const OutputFile& file, const SidecarHeader& header, const Bak
         }));
     }
     for (size_t c = 0; c < gradients.size(); ++c) {
-        writer.add(grids.makeItems(vectorType(header.valueType), gradients[c], baked.table,
-                                   [&](size_t i) { return baked.shape(i * channels + c); }));
+        const auto grid = grids.makeItems(vectorType(header.valueType), gradients[c], baked.table,
+                                          [&](size_t i) { return baked.shape(i * channels + c); });
+        grid->setGridClass(openvdb::GRID_UNKNOWN);  // signed: no density
+        writer.add(grid);
     }
     for (size_t level = 1; level <= baked.levels.size(); ++level) {
         const ValueTable& means = baked.levels[level - 1];

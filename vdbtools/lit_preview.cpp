@@ -78,9 +78,6 @@ const std::vector<Source>& sources() {
     return list;
 }
 
-// From a cell's first place to its corners, x slowest; as bricks have them.
-constexpr size_t kCellCorners[] = {0, 1, 9, 10, 81, 82, 90, 91};
-
 /// What is behind the volume, by the height in the picture: a sky that tells little of its own.
 Color backdrop(double y) {
     Color color;
@@ -113,6 +110,30 @@ trk::Volume openLevel(const std::string& path, uint32_t level, float scale,
                              std::to_string(header.levels) + ", the levels of this sidecar");
     }
     return trk::openVolume(path.c_str(), "", volumeOptions(header, level, scale, color));
+}
+
+/// Whether the light at a vertex of a brick is ever looked up: a cell beside it holds something. In
+/// constant regions it always is.
+bool isNeeded(const ExtinctionField& field, SparseTable::Entry entry, const Int3& at) {
+    if (ExtinctionField::isConstant(entry)) {
+        return true;
+    }
+    constexpr int64_t kEdge = ExtinctionField::kBrickEdge;
+    const auto lo = [&](size_t a) { return std::max<int64_t>(at[a] - 1, 0); };
+    const auto hi = [&](size_t a) { return std::min<int64_t>(at[a] + 1, kEdge - 1); };
+    for (int64_t x = lo(0); x <= hi(0); ++x) {
+        for (int64_t y = lo(1); y <= hi(1); ++y) {
+            for (int64_t z = lo(2); z <= hi(2); ++z) {
+                for (size_t c = 0; c < field.channels(); ++c) {
+                    const auto vertex = static_cast<size_t>((x * kEdge + y) * kEdge + z);
+                    if (field.vertex(entry, vertex, c) > 0) {
+                        return true;
+                    }
+                }
+            }
+        }
+    }
+    return false;
 }
 
 }  // namespace
@@ -161,22 +182,21 @@ LitPreview::Light LitPreview::computeLight(const Vec3d& local) const {
     return light;
 }
 
-/// Tabulates the light at the corners of a brick's cells, of those that hold anything, and as
-/// finely in large constant regions as their size allows.
+/// Tabulates the light at the corners of a brick's cells, of those that hold anything, and more
+/// coarsely in constant regions.
 void LitPreview::tabulateLight() {
     const ExtinctionField& field = volume_.field;
-    struct Region {
-        Int3 lo;
-        int shift;
-        SparseTable::Entry entry;  // the field's
-    };
-    std::vector<Region> regions;
+    size_t places = 0;
     const auto add = [&](const Int3& origin, int shift, SparseTable::Entry entry) {
-        regions.push_back({origin, shift, entry});
-        return static_cast<SparseTable::Entry>(regions.size());
+        const bool coarse =
+            ExtinctionField::isConstant(entry) && shift == ExtinctionField::kBrickShift;
+        const int64_t cells = coarse ? 1 : ExtinctionField::kBrickSize;
+        regions_.push_back({origin, shift, entry, cells, places});
+        places += static_cast<size_t>((cells + 1) * (cells + 1) * (cells + 1));
+        return static_cast<SparseTable::Entry>(regions_.size());
     };
-    regions_ = SparseTable(ExtinctionField::kBrickShift, field.box());
-    regions_.fill(
+    table_ = SparseTable(ExtinctionField::kBrickShift, field.box());
+    table_.fill(
         [&](const Int3& origin, int shift) -> std::optional<SparseTable::Entry> {
             const auto found = field.table().find(origin[0], origin[1], origin[2]);
             if (found.shift < shift || !ExtinctionField::isConstant(found.entry)) {
@@ -189,70 +209,61 @@ void LitPreview::tabulateLight() {
             const auto found = field.table().find(origin[0], origin[1], origin[2]);
             return add(origin, ExtinctionField::kBrickShift, found.entry);
         });
-    std::vector<size_t> needed;  // places of all regions, counted through
-    for (size_t r = 0; r < regions.size(); ++r) {
-        const SparseTable::Entry entry = regions[r].entry;
-        std::array<char, kPlaces> marks{};
-        for (size_t cell = 0; cell < 512; ++cell) {
-            const size_t first = ((cell >> 6) * kEdge + (cell >> 3 & 7)) * kEdge + (cell & 7);
-            bool occupied = ExtinctionField::isConstant(entry);
-            for (const size_t corner : kCellCorners) {
-                for (size_t c = 0; c < field.channels() && !occupied; ++c) {
-                    occupied = field.vertex(entry, first + corner, c) > 0;
+    light_.resize(places);
+    tbb::parallel_for(tbb::blocked_range<size_t>(0, regions_.size(), 1), [&](const auto& range) {
+        for (size_t r = range.begin(); r != range.end(); ++r) {
+            const Region& region = regions_[r];
+            const int64_t edge = region.cells + 1;
+            tbb::parallel_for(int64_t{0}, edge * edge * edge, [&](int64_t i) {
+                const Int3 at{{i / (edge * edge), i / edge % edge, i % edge}};
+                if (!isNeeded(field, region.entry, at)) {
+                    return;
                 }
-            }
-            for (const size_t corner : kCellCorners) {
-                marks[first + corner] = occupied ? 1 : marks[first + corner];
-            }
-        }
-        for (size_t i = 0; i < kPlaces; ++i) {
-            if (marks[i]) {
-                needed.push_back(r * kPlaces + i);
-            }
-        }
-    }
-    light_.resize(regions.size() * kPlaces);
-    tbb::parallel_for(tbb::blocked_range<size_t>(0, needed.size(), 16), [&](const auto& range) {
-        for (size_t n = range.begin(); n != range.end(); ++n) {
-            const Region& region = regions[needed[n] / kPlaces];
-            const size_t i = needed[n] % kPlaces;
-            const double spacing = std::ldexp(1.0, region.shift - 3);
-            const double step[3] = {static_cast<double>(i / (kEdge * kEdge)),
-                                    static_cast<double>(i / kEdge % kEdge),
-                                    static_cast<double>(i % kEdge)};
-            Vec3d place;
-            for (int a = 0; a < 3; ++a) {
-                place[a] =
-                    static_cast<double>(region.lo[static_cast<size_t>(a)]) + spacing * step[a];
-            }
-            light_[needed[n]] = computeLight(place);
+                const double spacing =
+                    std::ldexp(1.0, region.shift) / static_cast<double>(region.cells);
+                Vec3d place;
+                for (size_t a = 0; a < 3; ++a) {
+                    place[static_cast<int>(a)] =
+                        static_cast<double>(region.lo[a]) + spacing * static_cast<double>(at[a]);
+                }
+                light_[region.first + static_cast<size_t>(i)] = computeLight(place);
+            });
         }
     });
 }
 
 /// The tabulated light, interpolated.
 LitPreview::Light LitPreview::lightAt(const Vec3d& local) const {
-    const Int3 at{{static_cast<int64_t>(local[0]), static_cast<int64_t>(local[1]),
-                   static_cast<int64_t>(local[2])}};
-    const auto [entry, shift] = regions_.find(at[0], at[1], at[2]);
+    const auto entry = table_
+                           .find(static_cast<int64_t>(local[0]), static_cast<int64_t>(local[1]),
+                                 static_cast<int64_t>(local[2]))
+                           .entry;
     if (entry == SparseTable::kEmpty) {
         return {};
     }
-    size_t first = SparseTable::index(entry) * kPlaces;
+    const Region& region = regions_[SparseTable::index(entry)];
+    const auto edge = static_cast<size_t>(region.cells + 1);
+    const size_t stride[3] = {edge * edge, edge, 1};
+    const double cellsPerVoxel = std::ldexp(static_cast<double>(region.cells), -region.shift);
+    size_t first = region.first;
     float weight[3][2];
-    for (int a = 0; a < 3; ++a) {
-        const int64_t lo = at[static_cast<size_t>(a)] >> shift << shift;
-        const double x = std::ldexp(local[a] - static_cast<double>(lo), 3 - shift);
-        const auto cell = std::min(static_cast<size_t>(std::max(x, 0.0)), kEdge - 2);
-        first += cell * (a == 0 ? kEdge * kEdge : a == 1 ? kEdge : 1);
+    for (size_t a = 0; a < 3; ++a) {
+        const double x =
+            (local[static_cast<int>(a)] - static_cast<double>(region.lo[a])) * cellsPerVoxel;
+        const auto cell = std::min(static_cast<size_t>(std::max(x, 0.0)), edge - 2);
+        first += cell * stride[a];
         weight[a][1] = static_cast<float>(x - static_cast<double>(cell));
         weight[a][0] = 1 - weight[a][1];
     }
     Light light{};
     for (size_t corner = 0; corner < 8; ++corner) {
-        const float w = weight[0][corner >> 2] * weight[1][corner >> 1 & 1] * weight[2][corner & 1];
+        const size_t x = corner >> 2;
+        const size_t y = corner >> 1 & 1;
+        const size_t z = corner & 1;
+        const float w = weight[0][x] * weight[1][y] * weight[2][z];
+        const Light& there = light_[first + x * stride[0] + y * stride[1] + z * stride[2]];
         for (size_t k = 0; k < 3; ++k) {
-            light[k] += w * light_[first + kCellCorners[corner]][k];
+            light[k] += w * there[k];
         }
     }
     return light;

@@ -42,22 +42,31 @@ class LitPreview {
                  const std::function<void(double)>& progress) const;
 
     size_t bytes() const {
-        return volume_.bytes() + regions_.bytes() + light_.capacity() * sizeof(Light);
+        return volume_.bytes() + table_.bytes() + regions_.capacity() * sizeof(Region) +
+               light_.capacity() * sizeof(Light);
     }
 
   private:
     using Light = std::array<float, 3>;
-    static constexpr size_t kEdge = 9;  // places a region's edge at which light is tabulated
-    static constexpr size_t kPlaces = kEdge * kEdge * kEdge;
+
+    /// A brick of the field, or a constant region: light is tabulated at (cells + 1)^3 places.
+    struct Region {
+        trk::Int3 lo;
+        int shift;
+        trk::SparseTable::Entry entry;  // the field's
+        int64_t cells;                  // an edge
+        size_t first;                   // place, in light_; x slowest
+    };
 
     Light computeLight(const trk::Vec3d& local) const;
     Light lightAt(const trk::Vec3d& local) const;
     void tabulateLight();
     void drawPixel(const TrkRay& ray, Picture& picture, size_t pixel) const;
 
-    trk::Volume volume_;        // the interpolated control, as if it were a density
-    trk::SparseTable regions_;  // the field's bricks and constant regions, each its own item
-    std::vector<Light> light_;  // what arrives at the places of each region, x slowest
+    trk::Volume volume_;      // the interpolated control, as if it were a density
+    trk::SparseTable table_;  // to regions_
+    std::vector<Region> regions_;
+    std::vector<Light> light_;  // what arrives at their places
 };
 
 }  // namespace vdbtools

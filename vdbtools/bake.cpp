@@ -2,6 +2,8 @@
 #include "bake.h"
 
 #include "control_fit.h"
+#include "levels.h"
+#include "moments.h"
 
 #include <tbb/blocked_range.h>
 #include <tbb/parallel_for.h>
@@ -29,112 +31,6 @@ using trk::ValueTable;
 using trk::Vec3d;
 
 constexpr float kInfinity = std::numeric_limits<float>::infinity();
-
-/// Statistics of a cube of M^3 cells over its (M+1)^3 vertices. `mean` and `squares` (the sum of
-/// squared deviations from it) weigh a vertex by the part of it inside the cube, so that cubes side
-/// by side add up without counting a shared face twice.
-struct Moments {
-    float min = 0;
-    float max = 0;
-    double mean = 0;
-    double squares = 0;
-};
-
-Moments constantMoments(float value) {
-    return {value, value, static_cast<double>(value), 0};
-}
-
-CornerMoments constantCorners(float value) {
-    CornerMoments corners{};
-    corners.fill(0.125 * static_cast<double>(value));
-    return corners;
-}
-
-double trapezoid(size_t i, size_t last) {
-    return i == 0 || i == last ? 0.5 : 1.0;
-}
-
-/// One channel of a brick of the field, or of a part of one.
-struct BrickChannel {
-    const float* first;  ///< vertex at the cube's origin
-
-    const float* row(size_t x, size_t y) const {
-        return first + (x * ExtinctionField::kBrickEdge + y) * ExtinctionField::kBrickEdge;
-    }
-};
-
-CornerMoments cornerMoments(const BrickChannel& brick, size_t size) {
-    CornerMoments corners{};
-    const auto n = static_cast<double>(size);
-    for (size_t x = 0; x <= size; ++x) {
-        double plane[4] = {0, 0, 0, 0};  // by corner in y and z
-        for (size_t y = 0; y <= size; ++y) {
-            const float* row = brick.row(x, y);
-            double sum = 0.5 * (static_cast<double>(row[0]) + static_cast<double>(row[size]));
-            double upper = 0.5 * static_cast<double>(row[size]);
-            for (size_t z = 1; z < size; ++z) {
-                sum += static_cast<double>(row[z]);
-                upper += static_cast<double>(row[z]) * (static_cast<double>(z) / n);
-            }
-            const double weight = trapezoid(y, size);
-            const double up = static_cast<double>(y) / n;
-            plane[0] += weight * (1 - up) * (sum - upper);
-            plane[1] += weight * (1 - up) * upper;
-            plane[2] += weight * up * (sum - upper);
-            plane[3] += weight * up * upper;
-        }
-        const double weight = trapezoid(x, size) / (n * n * n);
-        const double up = static_cast<double>(x) / n;
-        for (size_t k = 0; k < 4; ++k) {
-            corners[k] += weight * (1 - up) * plane[k];
-            corners[4 + k] += weight * up * plane[k];
-        }
-    }
-    return corners;
-}
-
-/// Moments of one cube of `size`^3 cells of a brick. Two passes over values that are in L1:
-/// deviations from the mean do not cancel, and a cube of equal values has a mean of that very
-/// value.
-Moments cubeMoments(const BrickChannel& brick, size_t size) {
-    const auto weighted = [&](const auto& term) {
-        double sum = 0;
-        for (size_t x = 0; x <= size; ++x) {
-            double plane = 0;
-            for (size_t y = 0; y <= size; ++y) {
-                const float* row = brick.row(x, y);
-                double line = 0.5 * (term(row[0]) + term(row[size]));
-                for (size_t z = 1; z < size; ++z) {
-                    line += term(row[z]);
-                }
-                plane += trapezoid(y, size) * line;
-            }
-            sum += trapezoid(x, size) * plane;
-        }
-        return sum;
-    };
-    Moments m;
-    m.min = m.max = *brick.first;
-    for (size_t x = 0; x <= size; ++x) {
-        for (size_t y = 0; y <= size; ++y) {
-            const float* row = brick.row(x, y);
-            for (size_t z = 0; z <= size; ++z) {
-                m.min = std::min(m.min, row[z]);
-                m.max = std::max(m.max, row[z]);
-            }
-        }
-    }
-    if (m.min == m.max) {
-        return constantMoments(m.min);
-    }
-    m.mean = weighted([](float v) { return static_cast<double>(v); }) /
-             static_cast<double>(size * size * size);
-    m.squares = weighted([&](float v) {
-        const double d = static_cast<double>(v) - m.mean;
-        return d * d;
-    });
-    return m;
-}
 
 class Baker {
   public:
@@ -543,81 +439,11 @@ class Baker {
     BakedVolume baked_;
 };
 
-/// Means of the super-voxels twice as large as those of `finer`. `meanOf(index, channel)`.
-template <class MeanOf>
-ValueTable nextLevel(const SparseTable& finer, const trk::IntBox& box, size_t channels,
-                     const MeanOf& meanOf) {
-    ValueTable level;
-    const int shift = finer.itemShift() + 1;
-    const int64_t half = int64_t{1} << finer.itemShift();
-    level.table = SparseTable(shift, box);
-    using Mean = std::array<float, 3>;
-    std::map<Mean, SparseTable::Entry> known;
-    const auto add = [&](const Mean& mean) {
-        if (mean == Mean{}) {
-            return SparseTable::kEmpty;
-        }
-        const auto [it, isNew] = known.try_emplace(
-            mean, static_cast<SparseTable::Entry>(level.values.size() / channels + 1));
-        if (isNew) {
-            level.values.insert(level.values.end(), mean.begin(),
-                                mean.begin() + static_cast<std::ptrdiff_t>(channels));
-        }
-        return it->second;
-    };
-    level.table.fill(
-        [&](const Int3& origin, int regionShift) -> std::optional<SparseTable::Entry> {
-            const auto entry = finer.uniformEntry(origin, regionShift);
-            if (!entry) {
-                return std::nullopt;
-            }
-            Mean mean{};
-            for (size_t c = 0; c < channels && *entry != SparseTable::kEmpty; ++c) {
-                mean[c] = meanOf(SparseTable::index(*entry), c);
-            }
-            return add(mean);
-        },
-        [&](const Int3& origin) {
-            double sum[3] = {0, 0, 0};
-            for (int64_t octant = 0; octant < 8; ++octant) {
-                const auto entry =
-                    finer
-                        .find(origin[0] + (octant >> 2) * half,
-                              origin[1] + (octant >> 1 & 1) * half, origin[2] + (octant & 1) * half)
-                        .entry;
-                for (size_t c = 0; c < channels && entry != SparseTable::kEmpty; ++c) {
-                    sum[c] += static_cast<double>(meanOf(SparseTable::index(entry), c));
-                }
-            }
-            Mean mean{};
-            for (size_t c = 0; c < channels; ++c) {
-                mean[c] = static_cast<float>(sum[c] / 8);
-            }
-            return add(mean);
-        },
-        [&](const Int3& origin, int regionShift, SparseTable::Key& key) {
-            return finer.appendKey(origin, regionShift, key);
-        });
-    return level;
-}
-
 }  // namespace
 
 BakedVolume bake(const ExtinctionField& field, const BakeOptions& options) {
     BakedVolume baked = Baker(field, options).bake();
-    const size_t channels = baked.channels;
-    for (int i = 0; i < options.levels; ++i) {
-        if (i == 0) {
-            baked.levels.push_back(nextLevel(
-                baked.table, field.box(), channels,
-                [&](size_t item, size_t c) { return baked.items[item * channels + c].mean; }));
-        } else {
-            const ValueTable& finer = baked.levels.back();
-            baked.levels.push_back(nextLevel(
-                finer.table, field.box(), channels,
-                [&](size_t item, size_t c) { return finer.values[item * channels + c]; }));
-        }
-    }
+    addLevels(baked, field.box(), options.levels);
     return baked;
 }
 

@@ -26,9 +26,9 @@ struct ProceduralSummary {
     double voxelSize = 0;  ///< the box is 10 world units wide
 };
 
-/// Writes grid "density" (float or Vec3s, fog volume, values from 0 to 1) to `file`, without committing it.
-/// `progress(fraction)` is called now and then. The same options give the same voxels on any number
-/// of threads.
+/// Writes grid "density" (float or Vec3s, fog volume, values from 0 to 1) to `file`, without
+/// committing it. `progress(fraction)` is called now and then. The same options give the same
+/// voxels on any number of threads.
 ProceduralSummary writeProcedural(const ProceduralOptions& options, const trk::OutputFile& file,
                                   const std::function<void(double)>& progress);
 

@@ -68,8 +68,9 @@ const VdbEntry& choose(VdbFile& file, const DensityOptions& options) {
 
 void checkKind(const VdbEntry& entry, const openvdb::GridBase* grid, const std::string& where) {
     const auto refuse = [&](const std::string& found) {
-        throw Error(TRK_ERROR_UNSUPPORTED_GRID,
-                    where + ": is " + found + "; expected a fog volume of float, double, vec3s or vec3d");
+        throw Error(
+            TRK_ERROR_UNSUPPORTED_GRID,
+            where + ": is " + found + "; expected a fog volume of float, double, vec3s or vec3d");
     };
     const std::string valueType = valueTypeName(entry.type);
     if (!grid || channelCount(valueType) == 0) {
@@ -143,8 +144,7 @@ Density loadDensity(const std::string& path, const DensityOptions& options) {
 
     openvdb::GridBase::Ptr grid = file.read(entry, options.maxMemory);
     Density density;
-    grid->apply<DensityGrids>(
-        [&](const auto& typed) { density = convert(typed, options, where); });
+    grid->apply<DensityGrids>([&](const auto& typed) { density = convert(typed, options, where); });
     density.summary.path = path;
     density.summary.grid = {entry.name, entry.index};
     density.summary.valueType = valueTypeName(entry.type);

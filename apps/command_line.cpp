@@ -127,6 +127,13 @@ std::array<float, 3> colorOf(const Arguments& arguments) {
     return color;
 }
 
+void checkLevel(const std::string& sidecar, uint32_t level, const trk::SidecarHeader& header) {
+    if (level > static_cast<uint32_t>(header.levels)) {
+        throw UsageError("--level " + std::to_string(level) + ": expected 0 to " +
+                         std::to_string(header.levels) + ", the levels of " + sidecar);
+    }
+}
+
 float nonNegative(const Arguments& arguments, const std::string& option) {
     const float value = arguments.get<float>(option);
     if (!(value >= 0) || !std::isfinite(value)) {

@@ -2,6 +2,7 @@
 // What the commands share: options, usage errors, progress, names of choices.
 #pragma once
 
+#include "io/sidecar.h"
 #include "track/track.h"
 
 #include <boost/program_options.hpp>
@@ -76,6 +77,9 @@ uint32_t repairBits(const Arguments& arguments);
 /// --color r,g,b: what each channel's extinction is multiplied by.
 void addColorOption(boost::program_options::options_description& options);
 std::array<float, 3> colorOf(const Arguments& arguments);
+
+/// A UsageError where a sidecar has no such --level.
+void checkLevel(const std::string& sidecar, uint32_t level, const trk::SidecarHeader& header);
 
 /// A finite number >= 0, or a UsageError that names the option.
 float nonNegative(const Arguments& arguments, const std::string& option);

@@ -59,6 +59,9 @@ Json describeGrid(trk::VdbFile& file, const trk::VdbEntry& entry) {
         json["brick_storage"] = density.field.isHalf() ? "half" : "float";
         json["can_be_baked"] = true;
     } catch (const trk::Error& e) {
+        if (e.status() == TRK_ERROR_BAD_FILE) {  // not a kind of grid, but a damaged file
+            throw;
+        }
         const std::string where = file.path() + ": grid " + entry.label() + ": ";
         std::string reason = e.what();
         if (reason.compare(0, where.size(), where) == 0) {

@@ -9,6 +9,8 @@
 #include "lit_preview.h"
 #include "track/track.hpp"
 
+#include <unistd.h>
+
 #include <algorithm>
 #include <array>
 #include <cmath>
@@ -17,6 +19,7 @@
 #include <functional>
 #include <iostream>
 #include <memory>
+#include <optional>
 #include <sstream>
 #include <tuple>
 #include <utility>
@@ -139,7 +142,7 @@ std::vector<double> controlDepth(
 
 constexpr int kSketchHeight = 96;
 int sketchWidth(const Shot& shot) {
-    return std::max(1, static_cast<int>(std::min(kSketchHeight * shot.aspect(), 2048.0)));
+    return static_cast<int>(std::min(std::max(kSketchHeight * shot.aspect(), 32.0), 2048.0));
 }
 
 /// Frames the volume in all frames: moves the camera back until its box is seen whole, then narrows
@@ -183,9 +186,9 @@ void frameVolume(Shot& shot, const track::Volume& volume) {
     }
 }
 
-/// The scale at which the median transmittance of what meets anything is `median`, or 1 where
-/// nothing does.
-double defaultScale(const Shot& shot, const track::Volume& volume, double median) {
+/// The scale at which the median transmittance of what a small picture meets is `median`, or
+/// nothing where that is empty.
+std::optional<double> defaultScale(const Shot& shot, const track::Volume& volume, double median) {
     std::vector<double> hits;
     for (const double depth :
          controlDepth(volume, shot.camera, sketchWidth(shot), kSketchHeight, shot.level)) {
@@ -194,11 +197,26 @@ double defaultScale(const Shot& shot, const track::Volume& volume, double median
         }
     }
     if (hits.empty()) {
-        return 1;
+        return std::nullopt;
     }
     const auto middle = hits.begin() + static_cast<std::ptrdiff_t>(hits.size() / 2);
     std::nth_element(hits.begin(), middle, hits.end());
-    return -std::log(median) / *middle;
+    return std::min(-std::log(median) / *middle, 1e38);  // it becomes a float
+}
+
+/// Refuses pictures that this machine cannot hold, before the system kills whom it likes.
+void checkMemory(const Shot& shot) {
+    constexpr double kBytesPerPixel = 56;  // layers, and what writing them takes
+    const double wanted = kBytesPerPixel * shot.width * shot.height;
+    const double machine =
+        static_cast<double>(sysconf(_SC_PHYS_PAGES)) * static_cast<double>(sysconf(_SC_PAGESIZE));
+    if (wanted > machine) {
+        throw trk::Error(TRK_ERROR_OUT_OF_MEMORY,
+                         shot.output + ": " + std::to_string(shot.width) + "x" +
+                             std::to_string(shot.height) + " pixels need " +
+                             byteCount(static_cast<uint64_t>(wanted)) + ", and this machine has " +
+                             byteCount(static_cast<uint64_t>(machine)));
+    }
 }
 
 const std::array<std::string, 3> kRgb{"R", "G", "B"};
@@ -308,6 +326,8 @@ void run(const Command& command, const std::vector<std::string>& given) {
     addColorOption(options);
     const Arguments arguments(command, given, options, {"SIDECAR"}, 1);
     Shot shot = parseShot(arguments);
+    checkMemory(shot);
+    checkLevel(shot.sidecar, shot.level, trk::readSidecarHeader(shot.sidecar));
 
     TrkVolumeOptions volumeOptions = trkDefaultVolumeOptions();
     std::copy(shot.color.begin(), shot.color.end(), volumeOptions.color);
@@ -317,9 +337,13 @@ void run(const Command& command, const std::vector<std::string>& given) {
         frameVolume(shot, volume);
     }
     const double median = shot.lit ? 0.05 : 0.3;
-    const bool chosen = !arguments.has("scale") && info.superVoxelCount > 0;
+    std::string remark;
     if (!arguments.has("scale")) {
-        shot.scale = defaultScale(shot, volume, median);
+        const std::optional<double> scale = defaultScale(shot, volume, median);
+        shot.scale = scale.value_or(1);
+        remark = scale ? " (median transmittance " + formatNumber(median) + ")"
+                 : info.superVoxelCount == 0 ? " (the volume is empty)"
+                                             : " (nothing found to choose it by)";
     }
     const int frames = std::max(shot.frames, 1);
     const auto nameOf = [&](int frame) {
@@ -348,9 +372,7 @@ void run(const Command& command, const std::vector<std::string>& given) {
     if (!arguments.quiet()) {
         std::cerr << nameOf(0) << (frames > 1 ? " to " + nameOf(frames - 1) : "") << ": "
                   << shot.width << "x" << shot.height << ", scale " << formatNumber(shot.scale)
-                  << (chosen ? " (median transmittance " + formatNumber(median) + ")" : "")
-                  << (info.superVoxelCount == 0 ? " (the volume is empty)" : "") << ", level "
-                  << shot.level << "\n";
+                  << remark << ", level " << shot.level << "\n";
     }
 }
 

@@ -198,6 +198,18 @@ void run(const Command& command, const std::vector<std::string>& given) {
     if (!useSidecar && std::filesystem::exists(beside) && trk::isSidecar(beside)) {
         volumeOptions.repair |= trk::readSidecarHeader(beside).repair;
     }
+    const std::string used = arguments.has("sidecar") ? sidecar : beside;
+    if (useSidecar && std::filesystem::exists(used) && trk::isSidecar(used)) {
+        const trk::SidecarHeader header = trk::readSidecarHeader(used);
+        checkLevel(used, query.level, header);
+        const bool constantOnly =
+            volumeOptions.choice == TRK_CHOICE_MIN || volumeOptions.choice == TRK_CHOICE_MAX;
+        if (constantOnly && header.controlKind != trk::ControlKind::kConstant) {
+            throw UsageError("--choice " + arguments.text("choice") + ": the control of " + used +
+                             " is " + trk::controlName(header.controlKind) +
+                             "; expected robust or mean");
+        }
+    }
     const track::Volume volume = track::Volume::open(input,
                                                      arguments.has("sidecar") ? sidecar.c_str()
                                                      : useSidecar             ? nullptr

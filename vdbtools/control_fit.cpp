@@ -9,6 +9,7 @@
 #include <algorithm>
 #include <cmath>
 #include <functional>
+#include <limits>
 #include <numeric>
 
 namespace vdbtools {
@@ -22,6 +23,7 @@ constexpr uint32_t kNoPart = 0xffffffffu;
 // Beside super-voxels whose corners are 0, a fit that keeps the mass must exceed the density: by
 // about a half where that is a plane. Beyond twice it, mass is better lost.
 constexpr double kOvershoot = 2;
+constexpr auto kLargest = static_cast<double>(std::numeric_limits<float>::max());
 
 }  // namespace
 
@@ -37,9 +39,10 @@ std::array<float, 3> fitGradient(const CornerMoments& moments, double mean, int 
         }
         gradient[axis] = 0.5 * n * difference / spread;
     }
-    // Least squares are isotropic in the gradient, and the control is >= 0 where
+    // Least squares are isotropic in the gradient, and the control is >= 0 (and a float) where
     // |gx| + |gy| + |gz| <= mean / (n / 2): the nearest such gradient has all components shortened
     // by the same amount [Duchi et al. 2008].
+    const double limit = 2 * std::min(mean, kLargest - mean) / n;
     std::array<double, 3> sizes{
         {std::fabs(gradient[0]), std::fabs(gradient[1]), std::fabs(gradient[2])}};
     std::sort(sizes.begin(), sizes.end(), std::greater<>());
@@ -47,7 +50,7 @@ std::array<float, 3> fitGradient(const CornerMoments& moments, double mean, int 
     double sum = 0;
     for (size_t i = 0; i < 3; ++i) {
         sum += sizes[i];
-        const double candidate = (sum - 2 * mean / n) / static_cast<double>(i + 1);
+        const double candidate = (sum - limit) / static_cast<double>(i + 1);
         if (candidate < sizes[i]) {
             shorten = std::max(candidate, 0.0);
         }
@@ -88,7 +91,8 @@ CornerFit::CornerFit(const std::vector<Cell>& cells, const Given& given, int siz
                 caps_.push_back(0);
             }
             corners[k] = it->second;
-            caps_[it->second] = std::max(caps_[it->second], kOvershoot * cell.max);
+            const double cap = std::min(kOvershoot * cell.max, kLargest);
+            caps_[it->second] = std::max(caps_[it->second], cap);
         }
         const auto parity =
             static_cast<size_t>((cell.at[0] & 1) << 2 | (cell.at[1] & 1) << 1 | (cell.at[2] & 1));

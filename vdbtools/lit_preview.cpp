@@ -112,6 +112,15 @@ trk::Volume openLevel(const std::string& path, uint32_t level, float scale,
     return trk::openVolume(path.c_str(), "", volumeOptions(header, level, scale, color));
 }
 
+/// In how many stretches a cell, or a constant region, is lit: more where much is absorbed, as most
+/// of that is near where the ray enters, or where it is long.
+int stretchCount(double length, double depth) {
+    constexpr double kThin = 0.3;
+    constexpr double kMost = 24;
+    const double byDepth = depth < kThin ? 1 : 8;
+    return static_cast<int>(std::min(std::max(byDepth, std::ceil(length - 1)), kMost));
+}
+
 /// Whether the light at a vertex of a brick is ever looked up: a cell beside it holds something. In
 /// constant regions it always is.
 bool isNeeded(const ExtinctionField& field, SparseTable::Entry entry, const Int3& at) {
@@ -290,6 +299,13 @@ void LitPreview::drawPixel(const TrkRay& ray, Picture& picture, size_t pixel) co
                          static_cast<double>(ray.origin[2])}};
         const double start = length(volume_.indexToWorld.point(entry) - eye);
         const auto mean = [](const Color& c) { return (c[0] + c[1] + c[2]) / 3; };
+        const auto densityAt = [&](const Vec3d& point) {
+            double sum = 0;
+            for (const float d : volume_.field.density<V::kDensityChannels>(point)) {
+                sum += static_cast<double>(d);
+            }
+            return sum;
+        };
         // One stretch in which light counts as constant.
         const auto addStretch = [&](double t0, double t1, const auto& passed) {
             const Light light = lightAt(local.at(0.5 * (t0 + t1)));
@@ -317,20 +333,25 @@ void LitPreview::drawPixel(const TrkRay& ray, Picture& picture, size_t pixel) co
                 if (most == 0) {
                     return true;
                 }
-                // A large constant region in stretches that absorb alike.
-                constexpr double kMaxStretches = 24;
-                const auto count = static_cast<int>(
-                    std::min(std::max(std::ceil(t1 - t0 - 1), 1.0), kMaxStretches));
-                double from = 0;  // shares of the region
+                const auto count = stretchCount(t1 - t0, most);
+                // The density at the ends says how the depth grows in between: all but linearly.
+                const double d0 = count > 1 ? densityAt(local.at(t0)) : 1;
+                const double d1 = count > 1 ? densityAt(local.at(t1)) : 1;
+                double from = 0;  // shares of the length, and of the depth
+                double depthFrom = 0;
                 for (int i = 1; i <= count; ++i) {
-                    const double absorbed = -std::expm1(-most) * i / count;
-                    const double to = i == count ? 1.0 : -std::log1p(-absorbed) / most;
+                    const double to = std::pow(static_cast<double>(i) / count, 2);
+                    const double depthTo =
+                        i == count || !(d0 + d1 > 0)
+                            ? to
+                            : std::min((2 * d0 * to + (d1 - d0) * to * to) / (d0 + d1), 1.0);
                     std::array<double, V::kChannels> passed;
                     for (size_t c = 0; c < V::kChannels; ++c) {
-                        passed[c] = std::exp(-depth[c] * (to - from));
+                        passed[c] = std::exp(-depth[c] * (depthTo - depthFrom));
                     }
                     addStretch(t0 + from * (t1 - t0), t0 + to * (t1 - t0), passed);
                     from = to;
+                    depthFrom = depthTo;
                 }
                 return std::max({transmittance[0], transmittance[1], transmittance[2]}) > kOpaque;
             });

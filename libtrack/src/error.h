@@ -12,10 +12,18 @@ namespace trk {
 class Error : public std::runtime_error {
   public:
     Error(TrkStatus status, const std::string& message)
-        : std::runtime_error(message), status_(status) {}
+        : std::runtime_error(oneLine(message)), status_(status) {}
     TrkStatus status() const noexcept { return status_; }
 
   private:
+    /// Messages quote what files say of themselves, and damaged ones say anything.
+    static std::string oneLine(std::string text) {
+        for (char& c : text) {
+            c = static_cast<unsigned char>(c) < ' ' || c == 0x7f ? '?' : c;
+        }
+        return text;
+    }
+
     TrkStatus status_;
 };
 

@@ -54,8 +54,12 @@ struct IntBox {
     }
 };
 
-/// The smallest float that is not below `value`.
+/// The smallest float that is not below `value`; the largest one where `value` exceeds all.
 inline float roundUp(double value) {
+    constexpr float kLargest = std::numeric_limits<float>::max();
+    if (value >= static_cast<double>(kLargest)) {
+        return kLargest;
+    }
     const auto nearest = static_cast<float>(value);
     return static_cast<double>(nearest) < value
                ? std::nextafter(nearest, std::numeric_limits<float>::infinity())

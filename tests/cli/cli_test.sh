@@ -170,8 +170,8 @@ case_colour() {
     done
     small_cloud
     expect 0 bake cloud.vdb --size 8 --control affine
-    expect 1 query cloud.vdb --rays rays.csv --choice max
-    one_line "choice min and max are constant controls"
+    expect 2 query cloud.vdb --rays rays.csv --choice max
+    contains stderr "--choice max: the control of cloud.track.vdb is affine"
     expect 0 query cloud.vdb --rays rays.csv --color 2,2,2
     [ "$(head -n 1 stdout)" = "ray,transmittance,stderr,optical_depth,lookups" ] ||
         fail "a tint that is none: $(head -n 1 stdout)"
@@ -201,9 +201,21 @@ case_turntable() {
     expect 1 preview cloud.track.vdb -o turn.png --frames 3 --resolution 40x30
     one_line "turn.0002.png: exists already"
     absent turn.0001.png
-    expect 1 preview cloud.track.vdb -o x.png --level 5
-    one_line "level 5: expected 0 to 4"
+    for command in "preview cloud.track.vdb -o x.png" "query cloud.vdb --rays rays.csv"; do
+        some_rays
+        # shellcheck disable=SC2086
+        expect 2 $command --level 5
+        contains stderr "--level 5: expected 0 to 4, the levels of cloud.track.vdb"
+    done
     absent x.png
+    mkdir 'd#1'
+    expect 0 preview cloud.track.vdb -o 'd#1/f.png' --frames 2 --resolution 8x8
+    exists 'd#1/f.0002.png'
+    expect 0 preview cloud.track.vdb -o away.png --resolution 8x8 --camera 20,20,20,40,40,40,30
+    contains stderr "scale 1 (nothing found to choose it by)"
+    expect 1 preview cloud.track.vdb -o huge.png --resolution 65536x65536
+    one_line "huge.png: 65536x65536 pixels need"
+    absent huge.png
 }
 
 case_kinds_and_seeds() {
@@ -309,6 +321,8 @@ case_bad_files() {
         expect 1 bake cut.vdb
         one_line "cut.vdb"
         absent cut.track.vdb
+        expect 1 info cut.vdb
+        one_line "cut.vdb"
     done
     head -c $(($(stat -c %s cloud.track.vdb) / 2)) cloud.track.vdb >cut.track.vdb
     expect 1 preview cut.track.vdb

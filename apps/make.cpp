@@ -13,10 +13,11 @@ namespace po = boost::program_options;
 
 void run(const Command& command, const std::vector<std::string>& given) {
     po::options_description options("Options");
-    options.add_options()("kind", po::value<std::string>()->default_value("cloud"),
-                          "cloud (a cumulus), smoke (a thin plume) or color-cloud (a cumulus with three "
-                          "channels of different shapes)")(
-        "voxels", po::value<int>()->default_value(256), "along each edge of its box, 16 to 2048")(
+    options.add_options()(
+        "kind", po::value<std::string>()->default_value("cloud"),
+        "cloud (a cumulus), smoke (a thin plume) or color-cloud (a cumulus with three "
+        "channels of different shapes)")("voxels", po::value<int>()->default_value(256),
+                                         "along each edge of its box, 16 to 2048")(
         "seed", po::value<uint64_t>()->default_value(1), "another number, another volume")(
         "force", po::bool_switch(), "replace an existing file");
     const Arguments arguments(command, given, options, {"OUT.vdb"}, 1);
@@ -42,7 +43,8 @@ void run(const Command& command, const std::vector<std::string>& given) {
 }  // namespace
 
 const Command kMakeCommand{
-    "make", "vdbtrack make OUT.vdb [--kind cloud|smoke|color-cloud] [--voxels 256] [--seed 1] [--force]",
+    "make",
+    "vdbtrack make OUT.vdb [--kind cloud|smoke|color-cloud] [--voxels 256] [--seed 1] [--force]",
     "Makes a procedural volume that looks real.", run};
 
 }  // namespace apps

@@ -164,8 +164,9 @@ Volume openVolume(const char* vdbPath, const char* sidecarPath, const VolumeOpti
             options.choice == TRK_CHOICE_MIN || options.choice == TRK_CHOICE_MAX;
         if (constantOnly && sidecar.baked.kind != ControlKind::kConstant) {
             throw Error(TRK_ERROR_INVALID_ARGUMENT,
-                        volume.sidecarPath + ": choice min and max are constant controls, and this "
-                                             "sidecar's is " +
+                        volume.sidecarPath +
+                            ": choice min and max are constant controls, and this "
+                            "sidecar's is " +
                             controlName(sidecar.baked.kind) + "; expected robust or mean");
         }
         volume.superVoxels = SuperVoxels(std::move(sidecar.baked), volume.scales, options.choice,

@@ -64,8 +64,10 @@ void printVolume(const std::string& label, const std::string& vdb) {
     std::printf("\n%s: %llu active voxels\n\n", label.c_str(),
                 static_cast<unsigned long long>(density.summary.activeVoxels));
     std::printf(
-        "| size | control | RMS | sidecar | depth 1: variance | look-ups | time | score | depth 10: "
-        "variance | look-ups | time | score |\n|---|---|---|---|---|---|---|---|---|---|---|---|\n");
+        "| size | control | RMS | sidecar | depth 1: variance | look-ups | time | score | depth "
+        "10: "
+        "variance | look-ups | time | score "
+        "|\n|---|---|---|---|---|---|---|---|---|---|---|---|\n");
     for (const int size : {4, 8, 16, 32}) {
         std::vector<std::string> heads;
         std::vector<Row> rows;
@@ -82,7 +84,8 @@ void printVolume(const std::string& label, const std::string& vdb) {
             heads.emplace_back(head);
             for (const double depth : {1.0, 10.0}) {
                 const Way way{"", true, TRK_CHOICE_ROBUST, kind};
-                Row row{way, size, std::make_unique<Scene>(vdb, sidecar, way, depth, 300), 0, 0, {}};
+                Row row{way, size, std::make_unique<Scene>(vdb, sidecar, way, depth, 300),
+                        0,   0,    {}};
                 for (const PreparedRay& ray : row.scene->rays) {
                     const Moments m = momentsOf(*row.scene, ray);
                     row.variance += m.variance / static_cast<double>(row.scene->rays.size());
@@ -104,8 +107,7 @@ void printVolume(const std::string& label, const std::string& vdb) {
                 const Row& row = rows[2 * i + d];
                 const Row& constant = rows[d];
                 const double time = median(row.times) / median(constant.times);
-                const double score =
-                    (0.01 + row.variance) * time / (0.01 + constant.variance);
+                const double score = (0.01 + row.variance) * time / (0.01 + constant.variance);
                 std::printf(" %.4f | %.2f | %.2f | %.2f |", row.variance, row.lookups, time, score);
             }
             std::printf("\n");

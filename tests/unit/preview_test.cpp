@@ -95,9 +95,8 @@ TEST(Preview, ComesNearerToExactAsSuperVoxelsShrink) {
 TEST(Preview, LayersMeanWhatTheirNamesSay) {
     // A box of density 1 from 0 to 64 along each axis; at scale 0.1 half the light is left after
     // ln 2 / 0.1 = 6.9 units.
-    const auto grid =
-        fixtures::makeGrid(openvdb::CoordBBox(openvdb::Coord(0), openvdb::Coord(64)),
-                           [](const openvdb::Coord&) { return 1.0f; });
+    const auto grid = fixtures::makeGrid(openvdb::CoordBBox(openvdb::Coord(0), openvdb::Coord(64)),
+                                         [](const openvdb::Coord&) { return 1.0f; });
     const std::string vdb = fixtures::write("box.vdb", {grid});
     const std::string sidecar = fixtures::path("box.track.vdb");
     fixtures::bake(vdb, sidecar, 4, 1);
@@ -176,9 +175,9 @@ TEST(Camera, AnOrbitKeepsTheDistanceAndComesBack) {
     const TrkRay ray = half.ray(0.5, 0.5, 1);  // through the middle: at the centre
     const double distance = trk::length(centre - half.eye);
     for (int a = 0; a < 3; ++a) {
-        EXPECT_NEAR(static_cast<double>(ray.origin[a]) +
-                        distance * static_cast<double>(ray.direction[a]),
-                    centre[a], 1e-5);
+        EXPECT_NEAR(
+            static_cast<double>(ray.origin[a]) + distance * static_cast<double>(ray.direction[a]),
+            centre[a], 1e-5);
     }
 }
 

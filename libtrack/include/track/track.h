@@ -79,8 +79,8 @@ enum {
     TRK_METHOD_CONTROL = 3   /**< the baked control alone: biased, no noise, for level of detail */
 };
 
-/** The control of the residual method, chosen per super-voxel when a volume is opened. Sidecars with
- *  trilinear or affine controls know robust and mean, which is the control as baked. */
+/** The control of the residual method, chosen per super-voxel when a volume is opened. Sidecars
+ * with trilinear or affine controls know robust and mean, which is the control as baked. */
 typedef int32_t TrkChoice;
 enum {
     TRK_CHOICE_ROBUST =
@@ -107,14 +107,14 @@ typedef struct TrkVolumeOptions {
     size_t size;          /**< sizeof(TrkVolumeOptions) */
     const char* gridName; /**< NAME or NAME[i]; NULL: the only density-like grid, else "density" */
     float scale;          /**< extinction = scale x density, in 1/world unit; finite and >= 0 */
-    float color[3];       /**< extinction of channel k = scale x color[k] x density; finite and >= 0.
-                               Tints a density of one channel, which then has three unless all
-                               agree; a channel of 0 has a transmittance of exactly 1 */
-    TrkChoice choice;     /**< control of TRK_METHOD_RESIDUAL */
-    TrkCheck check;       /**< how far to distrust the sidecar */
-    uint32_t repair;      /**< TRK_REPAIR_… bits; those the sidecar was baked with are added */
-    uint64_t maxMemory;   /**< refuse to hold more bytes than this; 0: no limit */
-    int32_t threads;      /**< threads used for opening; 0: all */
+    float color[3];     /**< extinction of channel k = scale x color[k] x density; finite and >= 0.
+                             Tints a density of one channel, which then has three unless all
+                             agree; a channel of 0 has a transmittance of exactly 1 */
+    TrkChoice choice;   /**< control of TRK_METHOD_RESIDUAL */
+    TrkCheck check;     /**< how far to distrust the sidecar */
+    uint32_t repair;    /**< TRK_REPAIR_… bits; those the sidecar was baked with are added */
+    uint64_t maxMemory; /**< refuse to hold more bytes than this; 0: no limit */
+    int32_t threads;    /**< threads used for opening; 0: all */
 } TrkVolumeOptions;
 
 static inline TrkVolumeOptions trkDefaultVolumeOptions(void) {

@@ -101,7 +101,8 @@ std::array<double, Field::kChannels> trackTransmittance(const Field& field,
             return true;
         }
         for (size_t c = 0; c < C; ++c) {
-            opticalDepth[c] += settings.lengthPerVoxel * Method::integrate(v, c, ray, tEnter, tExit);
+            opticalDepth[c] +=
+                settings.lengthPerVoxel * Method::integrate(v, c, ray, tEnter, tExit);
         }
         while (distance < remaining) {
             remaining -= distance;
@@ -111,8 +112,7 @@ std::array<double, Field::kChannels> trackTransmittance(const Field& field,
             for (size_t c = 0; c < C; ++c) {
                 // A channel without residual here keeps its weight to the bit.
                 if (C == 1 || Method::bound(v, c) > 0) {
-                    products[c].multiply(1 -
-                                         (extinction[c] - Method::control(v, c, point)) / rate);
+                    products[c].multiply(1 - (extinction[c] - Method::control(v, c, point)) / rate);
                 }
                 allZero = allZero && products[c].isZero();
             }

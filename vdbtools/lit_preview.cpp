@@ -115,9 +115,9 @@ trk::Volume openLevel(const std::string& path, uint32_t level, float scale,
 /// In how many stretches a cell, or a constant region, is lit: more where much is absorbed, as most
 /// of that is near where the ray enters, or where it is long.
 int stretchCount(double length, double depth) {
-    constexpr double kThin = 0.3;
     constexpr double kMost = 24;
-    const double byDepth = depth < kThin ? 1 : 8;
+    // In steps small enough that the change from one to the next is not seen.
+    const double byDepth = depth < 0.02 ? 1 : depth < 0.3 ? 4 : 8;
     return static_cast<int>(std::min(std::max(byDepth, std::ceil(length - 1)), kMost));
 }
 

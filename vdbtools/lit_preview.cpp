@@ -161,7 +161,7 @@ LitPreview::Light LitPreview::computeLight(const Vec3d& local) const {
     }
     const Vec3d world = volume_.indexToWorld.point(index);
     Color sum{};
-    trk::withVariant(volume_, false, [&](auto variant) {
+    trk::withVariant(volume_, trk::ControlKind::kConstant, [&](auto variant) {
         using V = decltype(variant);
         const typename V::Extinction extinction(volume_);
         for (const Source& source : sources()) {
@@ -172,14 +172,14 @@ LitPreview::Light LitPreview::computeLight(const Vec3d& local) const {
             }
             ray.tMin = 0;
             ray.tMax = std::numeric_limits<float>::infinity();
-            LocalRay clipped;
-            double lengthPerVoxel = 0;
             std::array<double, V::kChannels> depth{};
-            if (volume_.clip(ray, volume_.field.box(), clipped, lengthPerVoxel) &&
-                clipped.tEnd > kShadowStart) {
+            const auto clipped = volume_.clip(ray, volume_.field.box());
+            if (clipped && clipped->local.tEnd > kShadowStart) {
                 uint64_t ignored = 0;
-                depth = extinction.integrate(clipped, kShadowStart, clipped.tEnd, ignored, ignored);
+                depth = extinction.integrate(clipped->local, kShadowStart, clipped->local.tEnd,
+                                             ignored, ignored);
             }
+            const double lengthPerVoxel = clipped ? clipped->lengthPerVoxel : 0.0;
             for (size_t k = 0; k < 3; ++k) {
                 sum[k] += source.radiance[k] * std::exp(-lengthPerVoxel * depth[k % V::kChannels]);
             }
@@ -283,13 +283,14 @@ void LitPreview::drawPixel(const TrkRay& ray, Picture& picture, size_t pixel) co
     Color radiance{};
     Color transmittance{{1, 1, 1}};
     double halfDepth = std::numeric_limits<double>::infinity();
-    trk::withVariant(volume_, false, [&](auto variant) {
+    trk::withVariant(volume_, trk::ControlKind::kConstant, [&](auto variant) {
         using V = decltype(variant);
-        LocalRay local;
-        double lengthPerVoxel = 0;
-        if (!volume_.clip(ray, volume_.field.box(), local, lengthPerVoxel)) {
+        const auto clipped = volume_.clip(ray, volume_.field.box());
+        if (!clipped) {
             return;
         }
+        const LocalRay& local = clipped->local;
+        const double lengthPerVoxel = clipped->lengthPerVoxel;
         // The clipped ray starts anew at the box.
         Vec3d entry = local.origin;
         for (int a = 0; a < 3; ++a) {

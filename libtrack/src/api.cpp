@@ -3,6 +3,7 @@
 #include "track/track.h"
 
 #include "error.h"
+#include "sampling.h"
 #include "transmittance.h"
 #include "volume.h"
 
@@ -76,6 +77,9 @@ trk::VolumeOptions checked(const TrkVolumeOptions& options) {
     if (options.choice < TRK_CHOICE_ROBUST || options.choice > TRK_CHOICE_MAX) {
         refuse("choice is " + std::to_string(options.choice) + "; expected a TRK_CHOICE_ constant");
     }
+    if (options.global > 1) {
+        refuse("global is " + std::to_string(options.global) + "; expected 0 or 1");
+    }
     if (options.check != TRK_CHECK_FULL && options.check != TRK_CHECK_METADATA) {
         refuse("check is " + std::to_string(options.check) + "; expected a TRK_CHECK_ constant");
     }
@@ -91,6 +95,7 @@ trk::VolumeOptions checked(const TrkVolumeOptions& options) {
     result.scale = options.scale;
     std::copy_n(options.color, 3, result.color.begin());
     result.choice = options.choice;
+    result.global = options.global != 0;
     result.check = options.check;
     result.repair = options.repair;
     result.maxMemory = options.maxMemory;
@@ -102,7 +107,7 @@ TrkQuery checked(const TrkQuery* given) {
         checkSize("TrkQuery", given->size, sizeof(TrkQuery));
     }
     TrkQuery query = given ? *given : trkDefaultQuery();
-    if (query.method < TRK_METHOD_EXACT || query.method > TRK_METHOD_CONTROL) {
+    if (query.method < TRK_METHOD_EXACT || query.method > TRK_METHOD_MARCH) {
         refuse("method is " + std::to_string(query.method) + "; expected a TRK_METHOD_ constant");
     }
     if (query.samples == 0) {
@@ -111,7 +116,20 @@ TrkQuery checked(const TrkQuery* given) {
     if (!(query.rate > 0) || !std::isfinite(query.rate)) {
         refuse("rate is " + std::to_string(query.rate) + "; expected a finite number > 0");
     }
-    if ((query.flags & ~uint32_t{TRK_QUERY_EXACT_FALLBACK}) != 0) {
+    if (query.method == TRK_METHOD_DELTA && query.rate < 1) {
+        refuse("rate is " + std::to_string(query.rate) +
+               "; expected at least 1, as delta tracking needs a majorant");
+    }
+    if (query.rateBase != TRK_RATE_BASE_MAJORANT && query.rateBase != TRK_RATE_BASE_RMS) {
+        refuse("rateBase is " + std::to_string(query.rateBase) +
+               "; expected a TRK_RATE_BASE_ constant");
+    }
+    if (!(query.step >= 0.001f) || !std::isfinite(query.step)) {
+        refuse("step is " + std::to_string(query.step) + "; expected a finite number >= 0.001");
+    }
+    constexpr uint32_t kFlags =
+        TRK_QUERY_EXACT_FALLBACK | TRK_QUERY_ROULETTE | TRK_QUERY_EXTINCTION;
+    if ((query.flags & ~kFlags) != 0) {
         refuse("flags has unknown bits; expected TRK_QUERY_ constants");
     }
     if (query.threads < 0) {
@@ -264,5 +282,45 @@ TrkStatus trkIntegrateOpticalDepth(const TrkVolume* volume, const TrkQuery* quer
                    "TRK_METHOD_CONTROL");
         }
         trk::integrateOpticalDepth(volume->volume, complete, rays, rayCount, opticalDepth);
+    });
+}
+
+TrkStatus trkSampleFreePath(const TrkVolume* volume, const TrkQuery* query, const TrkRay* rays,
+                            size_t rayCount, TrkFreePath* results) {
+    return guard([&] {
+        checkPointers(volume, rays, rayCount, results);
+        const TrkQuery complete = checked(query);
+        if (complete.method != TRK_METHOD_RESIDUAL && complete.method != TRK_METHOD_DELTA) {
+            refuse("method " + std::to_string(complete.method) +
+                   " has no free paths; expected TRK_METHOD_RESIDUAL or TRK_METHOD_DELTA");
+        }
+        if (complete.rate < 1) {
+            refuse("rate is " + std::to_string(complete.rate) +
+                   "; expected at least 1, as free paths need a majorant");
+        }
+        if (complete.samples != 1) {
+            refuse("samples is " + std::to_string(complete.samples) +
+                   "; expected 1: give other streams or ray ids for more paths of a ray");
+        }
+        trk::sampleFreePaths(volume->volume, complete, rays, rayCount, results);
+    });
+}
+
+TrkStatus trkSampleExtinction(const TrkVolume* volume, const float* points, size_t pointStride,
+                              size_t pointCount, float* extinction) {
+    return guard([&] {
+        if (!volume) {
+            refuse("volume is NULL");
+        }
+        if (pointCount > 0 && (!points || !extinction)) {
+            refuse("points or extinction is NULL; expected " + std::to_string(pointCount) +
+                   " points");
+        }
+        const size_t stride = pointStride == 0 ? 3 * sizeof(float) : pointStride;
+        if (stride < 3 * sizeof(float) || stride % alignof(float) != 0) {
+            refuse("pointStride is " + std::to_string(pointStride) +
+                   "; expected a multiple of 4 from 12 on");
+        }
+        trk::sampleExtinction(volume->volume, points, stride, pointCount, extinction);
     });
 }

@@ -79,7 +79,7 @@ struct ControlPolynomial {
 
 /// The control that a bake's `mean` and `shape` stand for, in super-voxels of `size` voxels.
 inline ControlPolynomial controlPolynomial(ControlKind kind, float mean, const float* shape,
-                                           int size) {
+                                           double size) {
     ControlPolynomial p;
     p.centre = static_cast<double>(mean);
     if (kind == ControlKind::kAffine) {

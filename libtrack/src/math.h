@@ -66,6 +66,11 @@ inline float roundUp(double value) {
                : nearest;
 }
 
+/// The largest float that is not above `value`, which must not be negative.
+inline float roundDown(double value) {
+    return -roundUp(-value);
+}
+
 /// x -> linear x + translation, from index space to world space. `linear[row][column]`.
 struct AffineMap {
     double linear[3][3] = {{1, 0, 0}, {0, 1, 0}, {0, 0, 1}};
@@ -110,11 +115,12 @@ struct AffineMap {
         return r;
     }
 
-    /// Length in world space of the longest diagonal of the index-space cube of side 1.
-    double longestDiagonal() const {
+    /// Length in world space of the longest diagonal of an index-space box with these edges.
+    double longestDiagonal(const Vec3d& edges) const {
         double longest = 0;
         for (int signs = 0; signs < 4; ++signs) {
-            const Vec3d d = vector({{1, signs & 1 ? -1.0 : 1.0, signs & 2 ? -1.0 : 1.0}});
+            const Vec3d d = vector(
+                {{edges[0], signs & 1 ? -edges[1] : edges[1], signs & 2 ? -edges[2] : edges[2]}});
             longest = std::max(longest, length(d));
         }
         return longest;

@@ -1,5 +1,5 @@
 // SPDX-License-Identifier: Apache-2.0
-// Random numbers that depend on nothing but who asks: (seed, stream, ray id, sample).
+// Random numbers that depend on nothing but who asks: (seed, stream, ray id, sample, purpose).
 #pragma once
 
 #include <cmath>
@@ -7,17 +7,25 @@
 
 namespace trk {
 
+/// What random numbers are for. A free path and the transmittance of the same ray are independent.
+enum class Purpose : uint64_t { kTransmittance, kFreePath };
+
 /// SplitMix64 [Steele, Lea, Flood 2014] started at a hash of its owner: one addition and one mixing
 /// a number, no state shared between rays, threads or calls.
 class Rng {
   public:
-    Rng(uint64_t seed, uint64_t stream, uint64_t rayId, uint64_t sample)
-        : state_(mix(mix(mix(mix(seed) + stream) + rayId) + sample)) {}
+    Rng(uint64_t seed, uint64_t stream, uint64_t rayId, uint64_t sample,
+        Purpose purpose = Purpose::kTransmittance)
+        : state_(mix(mix(mix(mix(seed) + stream) + rayId) + sample) ^
+                 static_cast<uint64_t>(purpose) * 0x2545f4914f6cdd1du) {}
 
     uint64_t next() {
         state_ += 0x9e3779b97f4a7c15u;
         return mix(state_);
     }
+
+    /// Uniformly distributed in [0, 1).
+    double uniform() { return static_cast<double>(next() >> 11) * 0x1p-53; }
 
     /// Exponentially distributed with mean 1; from 0 to 23.
     double exponential() {

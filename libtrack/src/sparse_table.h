@@ -74,6 +74,15 @@ class SparseTable {
         root_.assign(static_cast<size_t>(rootSize_[0] * rootSize_[1] * rootSize_[2]), kEmpty);
     }
 
+    /// A table with one entry for the one item it has, of 2^itemShift voxels from 0 on.
+    static SparseTable uniform(int itemShift, Entry entry) {
+        SparseTable table;
+        table.itemShift_ = table.rootShift_ = itemShift;
+        table.rootSize_ = {{1, 1, 1}};
+        table.root_ = {entry};
+        return table;
+    }
+
     int itemShift() const { return itemShift_; }
     bool empty() const { return root_.empty(); }
     size_t bytes() const {

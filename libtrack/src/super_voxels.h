@@ -8,6 +8,7 @@
 
 #include <algorithm>
 #include <array>
+#include <cmath>
 #include <cstddef>
 #include <cstdint>
 #include <vector>
@@ -48,7 +49,8 @@ struct BakedVolume {
     const float* shape(size_t item) const { return shapes.data() + item * shapeSize(kind); }
     /// The control of an item (a super-voxel and channel).
     ControlPolynomial control(size_t item) const {
-        return controlPolynomial(kind, items[item].mean, shape(item), superVoxelSize());
+        return controlPolynomial(kind, items[item].mean, shape(item),
+                                 std::ldexp(1.0, superVoxelShift));
     }
     /// Whether every channel of a super-voxel, whose first item is given, is the same everywhere.
     bool isHomogeneous(size_t firstItem) const {
@@ -67,10 +69,15 @@ struct BakedVolume {
 
 /// What a query needs of one channel of a super-voxel, in extinction (1/world unit).
 struct SuperVoxel {
-    float baked;    ///< the baked control at the super-voxel's centre
-    float control;  ///< of the residual method, as chosen, there
-    float bound;    ///< sup |extinction - control|
-    float max;      ///< equal to `baked` where the super-voxel is homogeneous
+    float baked;        ///< the baked control at the super-voxel's centre
+    float control;      ///< of the residual method, as chosen, there
+    float bound;        ///< sup |extinction - control|
+    float residualRms;  ///< root mean square of extinction - control, a quarter of bound at least
+    float min;          ///< of the extinction
+    float max;          ///< of the extinction; equal to `min` only where it is homogeneous
+    float rms;          ///< root mean square of the extinction, a quarter of max at least
+
+    bool isHomogeneous() const { return min == max; }
 };
 
 /// A super-voxel on a ray's way: C channels, a control of kind K.
@@ -155,7 +162,8 @@ class SuperVoxels {
     SuperVoxels() = default;
 
     /// `scales`: extinction of a density of 1, per channel; one or three, and as many as the bake
-    /// has channels unless that is one. `diagonal`: world length of a voxel's longest diagonal.
+    /// has channels unless that is one. `diagonal`: world length of a super-voxel's longest
+    /// diagonal.
     SuperVoxels(BakedVolume baked, const std::vector<double>& scales, TrkChoice choice,
                 double diagonal);
 
@@ -172,7 +180,7 @@ class SuperVoxels {
     /// without a point is asked.
     template <size_t C, ControlKind K, class Visit>
     void walk(const LocalRay& ray, double t0, double t1, Visit&& visit) const {
-        const double inverseSize = 1.0 / size();
+        const double inverseSize = std::ldexp(1.0, -table_.itemShift());
         table_.walk(
             ray, t0, t1,
             [&](SparseTable::Entry entry, const Int3& lo, int, double tEnter, double tExit) {
@@ -213,6 +221,10 @@ class SuperVoxels {
             });
         return sum;
     }
+
+    /// The whole of a bake as one super-voxel over `box`, outside which the density is 0, with a
+    /// constant control.
+    static BakedVolume whole(const BakedVolume& baked, const IntBox& box);
 
     /// The constant control that `choice` makes of statistics given as true extinction. `diagonal`:
     /// world length of the super-voxel's longest diagonal.

@@ -1,15 +1,14 @@
 // SPDX-License-Identifier: Apache-2.0
 #include "transmittance.h"
 
+#include "batch.h"
 #include "error.h"
 #include "estimators/exact.h"
+#include "estimators/free_path.h"
 #include "estimators/ratio_tracking.h"
+#include "estimators/ray_marching.h"
 #include "rng.h"
 #include "variant.h"
-
-#include <tbb/blocked_range.h>
-#include <tbb/parallel_for.h>
-#include <tbb/task_arena.h>
 
 #include <algorithm>
 #include <array>
@@ -20,47 +19,12 @@
 namespace trk {
 namespace {
 
-const TrkRay& rayAt(const TrkQuery& query, const TrkRay* rays, size_t i) {
-    return *reinterpret_cast<const TrkRay*>(reinterpret_cast<const unsigned char*>(rays) +
-                                            i * query.rayStride);
-}
-
-bool isValid(const TrkRay& ray) {
-    bool finite = !std::isnan(ray.tMin) && !std::isnan(ray.tMax);
-    bool zero = true;
-    for (int a = 0; a < 3; ++a) {
-        finite = finite && std::isfinite(ray.origin[a]) && std::isfinite(ray.direction[a]);
-        zero = zero && ray.direction[a] == 0;
-    }
-    return finite && !zero;
-}
-
-void checkRays(const TrkQuery& query, const TrkRay* rays, size_t rayCount) {
-    for (size_t i = 0; i < rayCount; ++i) {
-        if (!isValid(rayAt(query, rays, i))) {
-            throw Error(TRK_ERROR_INVALID_ARGUMENT,
-                        "ray " + std::to_string(i) +
-                            ": expected a finite origin, a finite direction that is not zero, and "
-                            "limits that are not NaN");
-        }
-    }
-}
-
 void checkMethod(const Volume& volume, const TrkQuery& query) {
-    const bool needsDensity = query.method != TRK_METHOD_CONTROL;
-    const bool needsSidecar = query.method != TRK_METHOD_EXACT;
-    if (needsDensity && !volume.hasDensity) {
-        throw Error(TRK_ERROR_NO_DENSITY,
-                    volume.sidecarPath +
-                        ": opened without its density, which this method looks up; open the "
-                        "density's .vdb too, or use the control method");
+    if (query.method != TRK_METHOD_CONTROL) {
+        requireDensity(volume);
     }
-    if (needsSidecar && !volume.hasSuperVoxels) {
-        throw Error(TRK_ERROR_NO_SIDECAR,
-                    "grid " + volume.grid.name +
-                        ": this method needs a sidecar, and none was found" +
-                        (volume.sidecarPath.empty() ? "" : " at " + volume.sidecarPath) +
-                        "; make it with `vdbtrack bake`, or use the exact method");
+    if (query.method != TRK_METHOD_EXACT && query.method != TRK_METHOD_MARCH) {
+        requireSuperVoxels(volume);
     }
     if (query.method == TRK_METHOD_CONTROL && query.level > volume.superVoxels.levelCount()) {
         throw Error(TRK_ERROR_INVALID_ARGUMENT,
@@ -75,20 +39,21 @@ template <class V>
 std::array<double, V::kChannels> deterministicDepth(const Volume& volume, const TrkQuery& query,
                                                     const TrkRay& ray, double& clippedLength,
                                                     PathCost& cost) {
-    LocalRay local;
-    double lengthPerVoxel = 0;
     const bool exact = query.method == TRK_METHOD_EXACT;
-    const IntBox& box = exact ? volume.field.box() : volume.superVoxels.box(query.level);
-    if (!volume.clip(ray, box, local, lengthPerVoxel)) {
+    const auto clipped =
+        volume.clip(ray, exact ? volume.field.box() : volume.superVoxels.box(query.level));
+    if (!clipped) {
         return {};
     }
-    clippedLength = local.tEnd;
+    clippedLength = clipped->local.tEnd;
     if (exact) {
-        return exactOpticalDepth(typename V::Extinction(volume), local, lengthPerVoxel, cost);
+        return exactOpticalDepth(typename V::Extinction(volume), clipped->local,
+                                 clipped->lengthPerVoxel, cost);
     }
-    auto depth = V::integrateControl(volume.superVoxels, local, query.level, cost.superVoxels);
+    auto depth =
+        V::integrateControl(volume.superVoxels, clipped->local, query.level, cost.superVoxels);
     for (double& d : depth) {
-        d *= lengthPerVoxel;
+        d *= clipped->lengthPerVoxel;
     }
     return depth;
 }
@@ -100,36 +65,67 @@ struct Estimate {
     std::array<double, C> standardError;
 };
 
-/// Of query.samples estimates.
-template <class V, class Method>
-Estimate<V::kChannels> trackSamples(const Volume& volume, const TrkQuery& query,
-                                    const LocalRay& ray, double lengthPerVoxel, uint64_t rayId,
-                                    PathCost& cost) {
-    TrackingSettings settings;
-    settings.lengthPerVoxel = lengthPerVoxel;
-    settings.rate = static_cast<double>(query.rate);
-    settings.exactFallback = (query.flags & TRK_QUERY_EXACT_FALLBACK) != 0;
-    const typename V::Extinction extinction(volume);
-    const typename V::Walk superVoxels{volume.superVoxels};
-    Estimate<V::kChannels> result{};
+/// Of query.samples estimates, each what `estimateOnce(rng)` answers.
+template <size_t C, class EstimateOnce>
+Estimate<C> averageSamples(const TrkQuery& query, uint64_t rayId,
+                           const EstimateOnce& estimateOnce) {
+    Estimate<C> result{};
     // Sums of squared deviations, updated without cancellation [Welford 1962].
-    std::array<double, V::kChannels> squares{};
+    std::array<double, C> squares{};
     for (uint32_t i = 0; i < query.samples; ++i) {
         Rng rng(query.seed, query.stream, rayId, i);
-        const auto estimate =
-            trackTransmittance<Method>(extinction, superVoxels, ray, settings, rng, cost);
-        for (size_t c = 0; c < V::kChannels; ++c) {
+        const std::array<double, C> estimate = estimateOnce(rng);
+        for (size_t c = 0; c < C; ++c) {
             const double delta = estimate[c] - result.mean[c];
             result.mean[c] += delta / (i + 1.0);
             squares[c] += delta * (estimate[c] - result.mean[c]);
         }
     }
     const double n = query.samples;
-    for (size_t c = 0; c < V::kChannels; ++c) {
+    for (size_t c = 0; c < C; ++c) {
         result.standardError[c] = query.samples > 1 ? std::sqrt(squares[c] / (n * (n - 1)))
                                                     : std::numeric_limits<double>::quiet_NaN();
     }
     return result;
+}
+
+/// Of a random method.
+template <class V>
+Estimate<V::kChannels> estimateRandomly(const Volume& volume, const TrkQuery& query,
+                                        const ClippedRay& clipped, uint64_t rayId, PathCost& cost) {
+    constexpr size_t C = V::kChannels;
+    const TrackingSettings settings = trackingSettings(query, clipped.lengthPerVoxel);
+    const LocalRay& ray = clipped.local;
+    const typename V::Extinction extinction(volume);
+    const typename V::Walk superVoxels{volume.tracked()};
+    const auto average = [&](const auto& estimateOnce) {
+        return averageSamples<C>(query, rayId, estimateOnce);
+    };
+    switch (query.method) {
+        case TRK_METHOD_RESIDUAL:
+            return average([&](Rng& rng) {
+                return trackTransmittance<ResidualControl>(extinction, superVoxels, ray, settings,
+                                                           rng, cost);
+            });
+        case TRK_METHOD_RATIO:
+            return average([&](Rng& rng) {
+                return trackTransmittance<NoControl>(extinction, superVoxels, ray, settings, rng,
+                                                     cost);
+            });
+        case TRK_METHOD_DELTA:
+            return average([&](Rng& rng) {
+                return trackBinary(extinction, superVoxels, ray, settings, rng, cost);
+            });
+        default:  // TRK_METHOD_MARCH
+            return average([&](Rng& rng) {
+                auto result = marchOpticalDepth(extinction, ray, settings.lengthPerVoxel,
+                                                static_cast<double>(query.step), rng, cost);
+                for (double& value : result) {
+                    value = std::exp(-value);
+                }
+                return result;
+            });
+    }
 }
 
 float toFloat(double value) {
@@ -153,16 +149,10 @@ void estimateRay(const Volume& volume, const TrkQuery& query, const TrkRay& ray,
             estimate.mean[c] = std::exp(-depth[c]);
         }
     } else {
-        LocalRay local;
-        double lengthPerVoxel = 0;
-        if (volume.clip(ray, volume.field.box(), local, lengthPerVoxel)) {
-            clippedLength = local.tEnd;
+        if (const auto clipped = volume.clip(ray, volume.field.box())) {
+            clippedLength = clipped->local.tEnd;
             samples = query.samples;
-            estimate =
-                query.method == TRK_METHOD_RESIDUAL
-                    ? trackSamples<V, ResidualControl>(volume, query, local, lengthPerVoxel, rayId,
-                                                       cost)
-                    : trackSamples<V, NoControl>(volume, query, local, lengthPerVoxel, rayId, cost);
+            estimate = estimateRandomly<V>(volume, query, *clipped, rayId, cost);
         } else if (query.samples == 1) {
             estimate.standardError.fill(std::numeric_limits<double>::quiet_NaN());
         }
@@ -181,49 +171,19 @@ void estimateRay(const Volume& volume, const TrkQuery& query, const TrkRay& ray,
     }
 }
 
-/// Runs body(i) for every ray: in this thread for one ray or one thread, else over TBB.
-template <class Body>
-void forEachRay(const TrkQuery& query, size_t rayCount, const Body& body) {
-    if (rayCount == 1 || query.threads == 1) {
-        for (size_t i = 0; i < rayCount; ++i) {
-            body(i);
-        }
-        return;
-    }
-    const auto run = [&] {
-        // Isolated: a thread that waits here must not pick up a task of the caller's, who may hold
-        // locks.
-        tbb::this_task_arena::isolate([&] {
-            tbb::parallel_for(tbb::blocked_range<size_t>(0, rayCount, 64),
-                              [&](const tbb::blocked_range<size_t>& range) {
-                                  for (size_t i = range.begin(); i != range.end(); ++i) {
-                                      body(i);
-                                  }
-                              });
-        });
-    };
-    if (query.threads == 0) {
-        run();
-    } else {
-        // More than the machine has would only make TBB print a warning.
-        const int most = tbb::this_task_arena::max_concurrency();
-        tbb::task_arena(std::min(query.threads, most)).execute(run);
-    }
-}
-
 }  // namespace
 
 void estimateTransmittance(const Volume& volume, const TrkQuery& query, const TrkRay* rays,
                            size_t rayCount, float* transmittance, TrkStatistics* statistics) {
     checkMethod(volume, query);
     checkRays(query, rays, rayCount);
-    const bool controlMatters =
-        query.method == TRK_METHOD_RESIDUAL || query.method == TRK_METHOD_CONTROL;
-    withVariant(volume, controlMatters, [&](auto variant) {
+    const ControlKind kind = query.method == TRK_METHOD_RESIDUAL  ? volume.tracked().kind()
+                             : query.method == TRK_METHOD_CONTROL ? volume.superVoxels.kind()
+                                                                  : ControlKind::kConstant;
+    withVariant(volume, kind, [&](auto variant) {
         using V = decltype(variant);
         forEachRay(query, rayCount, [&](size_t i) {
-            const uint64_t id = query.rayIds ? query.rayIds[i] : query.firstRayId + i;
-            estimateRay<V>(volume, query, rayAt(query, rays, i), id,
+            estimateRay<V>(volume, query, rayAt(query, rays, i), rayIdAt(query, i),
                            transmittance + i * V::kChannels, statistics ? statistics + i : nullptr);
         });
     });
@@ -233,7 +193,9 @@ void integrateOpticalDepth(const Volume& volume, const TrkQuery& query, const Tr
                            size_t rayCount, double* opticalDepth) {
     checkMethod(volume, query);
     checkRays(query, rays, rayCount);
-    withVariant(volume, query.method == TRK_METHOD_CONTROL, [&](auto variant) {
+    const ControlKind kind =
+        query.method == TRK_METHOD_CONTROL ? volume.superVoxels.kind() : ControlKind::kConstant;
+    withVariant(volume, kind, [&](auto variant) {
         using V = decltype(variant);
         forEachRay(query, rayCount, [&](size_t i) {
             PathCost cost;

@@ -37,13 +37,14 @@ struct Variant {
     }
 };
 
-/// Calls body(Variant) for what the volume is. Ratio tracking never looks at a control's slope.
+/// Calls body(Variant) for what the volume is. `kind`: that of the super-voxels to be walked, or
+/// kConstant where nobody looks at their control.
 template <class Body>
-void withVariant(const Volume& volume, bool controlMatters, const Body& body) {
+void withVariant(const Volume& volume, ControlKind kind, const Body& body) {
     const auto withKind = [&](auto f, auto c) {
         constexpr size_t F = decltype(f)::value;
         constexpr size_t C = decltype(c)::value;
-        switch (controlMatters ? volume.superVoxels.kind() : ControlKind::kConstant) {
+        switch (kind) {
             case ControlKind::kConstant:
                 return body(Variant<F, C, ControlKind::kConstant>());
             case ControlKind::kTrilinear:

@@ -54,11 +54,12 @@ void checkMemory(uint64_t wanted, uint64_t cap, const std::string& path) {
 
 }  // namespace
 
-bool Volume::clip(const TrkRay& ray, const IntBox& box, LocalRay& local,
-                  double& lengthPerVoxel) const {
+std::optional<ClippedRay> Volume::clip(const TrkRay& ray, const IntBox& box) const {
     if (box.empty() || !(ray.tMin < ray.tMax)) {
-        return false;
+        return std::nullopt;
     }
+    ClippedRay clipped;
+    LocalRay& local = clipped.local;
     const Vec3d worldOrigin{{static_cast<double>(ray.origin[0]), static_cast<double>(ray.origin[1]),
                              static_cast<double>(ray.origin[2])}};
     const Vec3d worldDirection{{static_cast<double>(ray.direction[0]),
@@ -81,7 +82,7 @@ bool Volume::clip(const TrkRay& ray, const IntBox& box, LocalRay& local,
             local.direction[a] = 0;
             local.inverse[a] = 1e300;
             if (!(origin[a] >= lo && origin[a] <= hi)) {
-                return false;
+                return std::nullopt;
             }
             continue;
         }
@@ -92,7 +93,7 @@ bool Volume::clip(const TrkRay& ray, const IntBox& box, LocalRay& local,
         t1 = std::min(t1, std::max(ta, tb));
     }
     if (!(t0 < t1)) {
-        return false;
+        return std::nullopt;
     }
     for (int a = 0; a < 3; ++a) {
         const auto axis = static_cast<size_t>(a);
@@ -101,8 +102,10 @@ bool Volume::clip(const TrkRay& ray, const IntBox& box, LocalRay& local,
             static_cast<double>(box.hi[axis]));
     }
     local.tEnd = t1 - t0;
-    lengthPerVoxel = length(worldDirection) / voxelsPerT;
-    return true;
+    clipped.lengthPerVoxel = length(worldDirection) / voxelsPerT;
+    clipped.tStart = t0 / voxelsPerT;
+    clipped.tPerVoxel = 1 / voxelsPerT;
+    return clipped;
 }
 
 std::string defaultSidecarPath(const std::string& vdbPath) {
@@ -162,15 +165,26 @@ Volume openVolume(const char* vdbPath, const char* sidecarPath, const VolumeOpti
         checkScale(volume.scales, sidecar.baked.maxDensity(), volume.sidecarPath);
         const bool constantOnly =
             options.choice == TRK_CHOICE_MIN || options.choice == TRK_CHOICE_MAX;
-        if (constantOnly && sidecar.baked.kind != ControlKind::kConstant) {
+        if (options.global && volume.hasDensity) {
+            const IntBox& box = volume.field.box();
+            Vec3d edges;
+            for (int a = 0; a < 3; ++a) {
+                const auto axis = static_cast<size_t>(a);
+                edges[a] = static_cast<double>(box.hi[axis] - box.lo[axis]);
+            }
+            volume.globalSuperVoxel =
+                SuperVoxels(SuperVoxels::whole(sidecar.baked, box), volume.scales, options.choice,
+                            volume.indexToWorld.longestDiagonal(edges));
+        } else if (constantOnly && sidecar.baked.kind != ControlKind::kConstant) {
             throw Error(TRK_ERROR_INVALID_ARGUMENT,
                         volume.sidecarPath +
                             ": choice min and max are constant controls, and this "
                             "sidecar's is " +
                             controlName(sidecar.baked.kind) + "; expected robust or mean");
         }
+        const double size = sidecar.baked.superVoxelSize();
         volume.superVoxels = SuperVoxels(std::move(sidecar.baked), volume.scales, options.choice,
-                                         volume.indexToWorld.longestDiagonal());
+                                         volume.indexToWorld.longestDiagonal({{size, size, size}}));
         volume.hasSuperVoxels = true;
     }
 #if defined(__GLIBC__)

@@ -10,6 +10,7 @@
 #include <array>
 #include <cstddef>
 #include <cstdint>
+#include <optional>
 #include <string>
 #include <vector>
 
@@ -35,6 +36,14 @@ struct GridIdentity {
     int index = 0;  ///< among the grids of equal name
 };
 
+/// The part of a world-space ray that lies in a box, in local space. `local` starts at t = 0.
+struct ClippedRay {
+    LocalRay local;
+    double lengthPerVoxel = 1;  ///< world length of a voxel length along the ray
+    double tStart = 0;          ///< the world-space ray's own parameter at local t = 0
+    double tPerVoxel = 1;
+};
+
 struct Volume {
     AffineMap indexToWorld;
     AffineMap worldToIndex;
@@ -47,19 +56,23 @@ struct Volume {
     ExtinctionField field;  ///< density
 
     bool hasSuperVoxels = false;
-    SuperVoxels superVoxels;
+    SuperVoxels superVoxels;                      ///< as baked
+    std::optional<SuperVoxels> globalSuperVoxel;  ///< one over everything, where that was asked for
 
     GridIdentity grid;
     std::string sidecarPath;  ///< the sidecar, or where it was looked for
     uint64_t activeVoxels = 0;
 
     size_t channels() const { return scales.size(); }
+    /// What the random methods walk over; control and levels are those of `superVoxels`.
+    const SuperVoxels& tracked() const {
+        return globalSuperVoxel ? *globalSuperVoxel : superVoxels;
+    }
+
     size_t bytes() const { return sizeof(*this) + field.bytes() + superVoxels.bytes(); }
 
-    /// Clips a world-space ray against a box of local space. False where nothing is left. The
-    /// result starts at t = 0 inside the box; `lengthPerVoxel` is the world length of a voxel
-    /// length.
-    bool clip(const TrkRay& ray, const IntBox& box, LocalRay& local, double& lengthPerVoxel) const;
+    /// Clips a world-space ray against a box of local space. Nothing where nothing is left.
+    std::optional<ClippedRay> clip(const TrkRay& ray, const IntBox& box) const;
 };
 
 /// The extinction of an opened volume, of C channels, from a density of F.
@@ -79,6 +92,30 @@ class VolumeExtinction {
     std::array<double, C> integrate(const LocalRay& ray, double t0, double t1, uint64_t& lookups,
                                     uint64_t& regions) const {
         return scaled(field_.integrate<F>(ray, t0, t1, lookups, regions));
+    }
+    /// Calls `visit(t0, t1, depth)` for every cell and constant region on the way, until it answers
+    /// false. `depth`: integral of the extinction, times the length of a voxel.
+    template <class Visit>
+    void forEachCell(const LocalRay& ray, double t0, double t1, Visit&& visit) const {
+        field_.forEachCell<F>(ray, t0, t1, [&](double tEnter, double tExit, const auto& depth) {
+            return visit(tEnter, tExit, scaled(depth));
+        });
+    }
+    /// Calls `visit(constant, t0, t1)` for every brick and constant region on the way, until it
+    /// answers false. `constant`: the extinction in a constant region, NULL in a brick.
+    template <class Visit>
+    void forEachRegion(const LocalRay& ray, double t0, double t1, Visit&& visit) const {
+        field_.table().walk(
+            ray, t0, t1,
+            [&](SparseTable::Entry entry, const Int3&, int, double tEnter, double tExit) {
+                if (!ExtinctionField::isConstant(entry)) {
+                    return visit(static_cast<const std::array<double, C>*>(nullptr), tEnter, tExit);
+                }
+                std::array<float, F> density;
+                std::copy_n(field_.constant(entry), F, density.begin());
+                const std::array<double, C> constant = scaled(density);
+                return visit(&constant, tEnter, tExit);
+            });
     }
 
   private:
@@ -101,6 +138,7 @@ struct VolumeOptions {
     float scale = 1;
     std::array<float, 3> color{{1, 1, 1}};
     TrkChoice choice = TRK_CHOICE_ROBUST;
+    bool global = false;
     TrkCheck check = TRK_CHECK_FULL;
     uint32_t repair = 0;
     uint64_t maxMemory = 0;

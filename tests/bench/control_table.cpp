@@ -33,10 +33,7 @@ double timeRays(const Row& row, uint64_t seed) {
     constexpr int kSamples = 20;
     double sum = 0;
     const auto start = std::chrono::steady_clock::now();
-    trk::withVariant(row.scene->volume, true, [&](auto variant) {
-        using V = decltype(variant);
-        const typename V::Extinction field(row.scene->volume);
-        const typename V::Walk superVoxels{row.scene->volume.superVoxels};
+    row.scene->withFields([&](auto, const auto& field, const auto& superVoxels) {
         trk::PathCost cost;
         for (size_t i = 0; i < row.scene->rays.size(); ++i) {
             const PreparedRay& ray = row.scene->rays[i];
@@ -83,7 +80,7 @@ void printVolume(const std::string& label, const std::string& vdb) {
                           static_cast<double>(std::filesystem::file_size(sidecar)) / 1000);
             heads.emplace_back(head);
             for (const double depth : {1.0, 10.0}) {
-                const Way way{"", true, TRK_CHOICE_ROBUST, kind};
+                const Way way{"", TRK_METHOD_RESIDUAL, TRK_CHOICE_ROBUST, kind};
                 Row row{way, size, std::make_unique<Scene>(vdb, sidecar, way, depth, 300),
                         0,   0,    {}};
                 for (const PreparedRay& ray : row.scene->rays) {

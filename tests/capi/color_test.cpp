@@ -42,9 +42,10 @@ track::Volume open(const Files& files, float scale, float r = 1, float g = 1, fl
 }
 
 std::vector<float> estimate(const track::Volume& volume, const std::vector<TrkRay>& rays,
-                            TrkMethod method) {
+                            TrkMethod method, uint32_t flags = trkDefaultQuery().flags) {
     TrkQuery query = trkDefaultQuery();
     query.method = method;
+    query.flags = flags;
     query.samples = 3;
     std::vector<float> result(rays.size() * volume.info().channels);
     volume.estimateTransmittance(query, rays.data(), rays.size(), result.data());
@@ -92,15 +93,17 @@ TEST(Colour, EqualChannelsHaveTheBitsOfGrey) {
         for (const TrkMethod method : kMethods) {
             const std::vector<float> expected = estimate(grey, rays, method);
             const std::vector<float> found = estimate(vectors, rays, method);
-            const std::vector<float> tint = estimate(tinted, rays, method);
+            // Roulette goes by the channel that still matters most.
+            const std::vector<float> whole = estimate(grey, rays, method, 0);
+            const std::vector<float> tint = estimate(tinted, rays, method, 0);
             double noise = 0;
             for (size_t i = 0; i < rays.size(); ++i) {
                 for (size_t c = 0; c < 3; ++c) {
                     ASSERT_EQ(found[3 * i + c], expected[i]) << trk::controlName(kind);
                 }
-                ASSERT_EQ(tint[3 * i], expected[i]);  // the densest channel sets the rate
-                ASSERT_EQ(tint[3 * i + 1], expected[i]);
-                noise += std::fabs(static_cast<double>(tint[3 * i + 2] - expected[i]));
+                ASSERT_EQ(tint[3 * i], whole[i]);  // the densest channel sets the rate
+                ASSERT_EQ(tint[3 * i + 1], whole[i]);
+                noise += std::fabs(static_cast<double>(tint[3 * i + 2] - whole[i]));
             }
             EXPECT_GT(noise, 1);
         }

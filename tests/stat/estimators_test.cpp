@@ -25,20 +25,8 @@ using namespace estimates;
 
 /// One estimate of one channel.
 double estimateOnce(const Scene& scene, const PreparedRay& ray, trk::Rng& rng, size_t channel = 0) {
-    double result = 0;
-    trk::withVariant(scene.volume, scene.way.residual, [&](auto variant) {
-        using V = decltype(variant);
-        trk::PathCost cost;
-        const trk::TrackingSettings settings = scene.settings(ray);
-        const typename V::Extinction field(scene.volume);
-        const typename V::Walk superVoxels{scene.volume.superVoxels};
-        result = scene.way.residual
-                     ? trk::trackTransmittance<trk::ResidualControl>(field, superVoxels, ray.local,
-                                                                     settings, rng, cost)[channel]
-                     : trk::trackTransmittance<trk::NoControl>(field, superVoxels, ray.local,
-                                                               settings, rng, cost)[channel];
-    });
-    return result;
+    trk::PathCost cost;
+    return scene.estimate(ray, scene.settings(ray), rng, cost)[channel];
 }
 
 /// What the negative controls take apart: a grey volume with a constant control.
@@ -72,9 +60,8 @@ void expectUnbiased(const Scene& scene, const std::string& label, size_t channel
     const double z = zOf(set, 1 + channel, [&](const PreparedRay& ray, trk::Rng& rng) {
         return estimateOnce(scene, ray, rng, channel);
     });
-    std::printf("%-38s %-17s z %5.2f skewness %5.2f kurtosis %5.2f, %.1f %% of the length exact",
-                label.c_str(), scene.way.name.c_str(), z, set.skewness, set.excessKurtosis,
-                100 * set.exactShare);
+    std::printf("%-38s %-17s z %5.2f skewness %5.2f kurtosis %5.2f", label.c_str(),
+                scene.way.name.c_str(), z, set.skewness, set.excessKurtosis);
     if (set.testedShare < 1) {
         std::printf(
             ", too heavy a tail on whole rays (kurtosis %.0e): tested %.0f %% of their "
@@ -84,34 +71,67 @@ void expectUnbiased(const Scene& scene, const std::string& label, size_t channel
     std::printf("\n");
     EXPECT_TRUE(set.isNormal()) << "too heavy a tail for this many samples";
     EXPECT_LT(std::fabs(z), bound) << label << " " << scene.way.name;
-    EXPECT_LT(set.exactShare, 0.1);
+    // In a thick super-voxel, here the whole volume, these controls have tails beyond testing.
+    const bool beyond = scene.way.choice == TRK_CHOICE_MAX || scene.way.choice == TRK_CHOICE_MEAN;
+    if (set.testedShare < 0.01 && beyond && scene.way.global && scene.depth > 1) {
+        std::printf("    not tested: the tail is too heavy on nearly all of the length\n");
+        return;
+    }
     EXPECT_GT(set.testedShare, 0.01);
-    if (scene.way.choice == TRK_CHOICE_ROBUST || scene.way.choice == TRK_CHOICE_MIN) {
+    const bool tame = scene.way.choice == TRK_CHOICE_ROBUST || scene.way.choice == TRK_CHOICE_MIN;
+    if (tame && scene.way.rateBase == RateBase::kMajorant && !scene.way.global &&
+        scene.depth <= 10) {
         EXPECT_EQ(set.testedShare, 1) << label << " " << scene.way.name;
     }
 }
 
-TEST(Estimators, AreUnbiasedForEveryControlSizeAndDepth) {
-    const std::vector<int> sizes{4, 8, 16, 32};
-    const std::vector<double> depths{1, 10};
-    const std::vector<Source> all = sources();
-    const double bound = sidakBound(all.size() * sizes.size() * depths.size() * kWays.size());
+/// Of one volume: which of sources().
+class EveryWay : public testing::TestWithParam<size_t> {
+  protected:
+    void SetUp() override {
+        if (GetParam() >= sources().size()) {
+            GTEST_SKIP() << "TRACK_TEST_DATA names no folder of real volumes";
+        }
+    }
+};
+
+TEST_P(EveryWay, IsUnbiasedForEverySizeAndDepth) {
+    const Source source = sources()[GetParam()];
+    // Sanitizers look at the same code on fewer estimates.
+    const std::vector<std::pair<int, double>> cases =
+        fixtures::kSanitized
+            ? std::vector<std::pair<int, double>>{{8, 1}, {16, 10}}
+            : std::vector<std::pair<int, double>>{{4, 1},  {4, 10},  {8, 1},  {8, 10}, {8, 100},
+                                                  {16, 1}, {16, 10}, {32, 1}, {32, 10}};
+    const double bound = sidakBound(cases.size() * kWays.size());
     std::printf("|z| must stay below %.2f\n", bound);
-    for (const Source& source : all) {
-        for (const int size : sizes) {
-            for (const Way& way : kWays) {
-                const std::string sidecar = sidecarOf(source, size, way.kind);
-                for (const double depth : depths) {
-                    const Scene scene(source.vdb, sidecar, way, depth, 300);
-                    char label[64];
-                    std::snprintf(label, sizeof(label), "%s, size %d, depth %g",
-                                  source.label.c_str(), size, depth);
-                    expectUnbiased(scene, label, 0, 150, bound);
-                }
-            }
+    for (const auto& [size, depth] : cases) {
+        for (const Way& way : kWays) {
+            const Scene scene(source.vdb, sidecarOf(source, size, way.kind), way, depth, 300);
+            char label[64];
+            std::snprintf(label, sizeof(label), "%s, size %d, depth %g", source.label.c_str(), size,
+                          depth);
+            expectUnbiased(scene, label, 0, 150, bound);
         }
     }
 }
+
+TEST_P(EveryWay, IsUnbiasedOverTheWholeVolumeAsOneSuperVoxel) {
+    const Source source = sources()[GetParam()];
+    const std::vector<double> depths =
+        fixtures::kSanitized ? std::vector<double>{10} : std::vector<double>{1, 10, 100};
+    const double bound = sidakBound(depths.size() * kGlobalWays.size());
+    std::printf("|z| must stay below %.2f\n", bound);
+    for (const double depth : depths) {
+        for (const Way& way : kGlobalWays) {
+            const Scene scene(source.vdb, sidecarOf(source, 16), way, depth, 100);
+            expectUnbiased(scene, source.label + ", depth " + std::to_string(int(depth)), 0, 100,
+                           bound);
+        }
+    }
+}
+
+INSTANTIATE_TEST_SUITE_P(Estimators, EveryWay, testing::Values(0, 1, 2));
 
 TEST(Estimators, AreUnbiasedInColour) {
     struct Colour {
@@ -122,15 +142,18 @@ TEST(Estimators, AreUnbiasedInColour) {
         {{"tinted cloud", fixtures::cloudFile(96)}, {{1, 0.25f, 2}}},
         {{"colour cloud", fixtures::cloudFile(96, "color-cloud")}, {{1, 1, 1}}},
         {{"tinted colour cloud", fixtures::cloudFile(96, "color-cloud")}, {{1, 0.25f, 0}}}};
-    const std::vector<double> depths{1, 5};
+    const std::vector<double> depths =
+        fixtures::kSanitized ? std::vector<double>{10} : std::vector<double>{1, 10, 100};
+    std::vector<Way> ways = kWays;
+    ways.insert(ways.end(), kGlobalWays.begin(), kGlobalWays.end());
     // One channel of the last volume is 0, and no estimate.
-    const double bound = sidakBound((3 * colours.size() - 1) * depths.size() * kWays.size());
+    const double bound = sidakBound((3 * colours.size() - 1) * depths.size() * ways.size());
     std::printf("|z| must stay below %.2f\n", bound);
     for (const auto& [source, color] : colours) {
-        for (const Way& way : kWays) {
+        for (const Way& way : ways) {
             const std::string sidecar = sidecarOf(source, 8, way.kind);
             for (const double depth : depths) {
-                const Scene scene(source.vdb, sidecar, way, depth, 150, color);
+                const Scene scene(source.vdb, sidecar, way, depth, 100, color);
                 ASSERT_EQ(scene.volume.channels(), 3u);
                 for (size_t channel = 0; channel < 3; ++channel) {
                     if (color[channel] == 0) {
@@ -141,7 +164,7 @@ TEST(Estimators, AreUnbiasedInColour) {
                     char label[64];
                     std::snprintf(label, sizeof(label), "%s, depth %g, channel %zu",
                                   source.label.c_str(), depth, channel);
-                    expectUnbiased(scene, label, channel, 150, bound);
+                    expectUnbiased(scene, label, channel, 100, bound);
                 }
             }
         }
@@ -170,8 +193,8 @@ void expectRejected(const Scene& scene, const Wrong& wrong, const Factor& factor
 TEST(Estimators, AControlDepthTwoPercentTooLargeIsRejected) {
     const Source source = sources().front();
     const std::string sidecar = sidecarOf(source, 8);
-    for (const size_t v : {1u, 2u}) {  // `min` has next to no control that could be wrong
-        const Scene scene(source.vdb, sidecar, kWays[v], 1, 300);
+    for (const char* way : {"robust", "mean"}) {  // `min` has next to no control to be wrong
+        const Scene scene(source.vdb, sidecar, wayNamed(way), 1, 300);
         const auto factor = [&](const PreparedRay& ray) {
             double depth = 0;
             Grey::Walk{scene.volume.superVoxels}.walk(
@@ -215,7 +238,7 @@ TEST(Estimators, ABoundOfZeroWhereThereIsResidualIsRejected) {
     const Source source = sources().front();
     const std::string sidecar = sidecarOf(source, 8);
     // Over many rays, residuals of a mean control cancel.
-    const Scene scene(source.vdb, sidecar, kWays[3], 1, 300);
+    const Scene scene(source.vdb, sidecar, wayNamed("min"), 1, 300);
     const LyingSuperVoxels lying{scene.volume.superVoxels};
     const Grey::Extinction field(scene.volume);
     expectRejected(
@@ -252,7 +275,8 @@ TEST(Estimators, RobustResidualBeatsRatioInVarianceTimesLookups) {
             const std::string sidecar = sidecarOf(source, size);
             double score[2];
             for (const size_t v : {0u, 1u}) {
-                const Scene scene(source.vdb, sidecar, kWays[v], depth, 300);
+                const Way way = wayNamed(v == 0 ? "ratio" : "robust");
+                const Scene scene(source.vdb, sidecar, way, depth, 300);
                 double variance = 0;
                 double lookups = 0;
                 for (const PreparedRay& ray : scene.rays) {
@@ -264,7 +288,7 @@ TEST(Estimators, RobustResidualBeatsRatioInVarianceTimesLookups) {
                 std::printf(
                     "%s size %d depth %g %s: variance %.3g, %.3g look-ups, (0.01 + variance) x "
                     "look-ups %.3g\n",
-                    source.label.c_str(), size, depth, kWays[v].name.c_str(), variance, lookups,
+                    source.label.c_str(), size, depth, way.name.c_str(), variance, lookups,
                     score[v]);
             }
             std::printf("residual over ratio: %.3f\n", score[1] / score[0]);

@@ -3,6 +3,7 @@
 #pragma once
 
 #include "estimators/exact.h"
+#include "estimators/free_path.h"
 #include "estimators/ratio_tracking.h"
 #include "rng.h"
 #include "support/rays.h"
@@ -26,23 +27,66 @@ using trk::LocalRay;
 
 using trk::ControlKind;
 
-/// One way of estimating: a method and, for residual, its control.
+using trk::RateBase;
+
+/// One way of estimating: a method, what it walks over, its control and its rate.
 struct Way {
     std::string name;
-    bool residual;
-    TrkChoice choice;
-    ControlKind kind;
+    TrkMethod method = TRK_METHOD_RESIDUAL;
+    TrkChoice choice = TRK_CHOICE_ROBUST;
+    ControlKind kind = ControlKind::kConstant;
+    RateBase rateBase = RateBase::kMajorant;
+    double rate = 1;
+    bool global = false;
 };
+
+/// Every method x kind of control x choice x base of the rate that there is, over super-voxels.
 inline const std::vector<Way> kWays{
-    {"ratio", false, TRK_CHOICE_ROBUST, ControlKind::kConstant},
-    {"robust", true, TRK_CHOICE_ROBUST, ControlKind::kConstant},
-    {"mean", true, TRK_CHOICE_MEAN, ControlKind::kConstant},
-    {"min", true, TRK_CHOICE_MIN, ControlKind::kConstant},
-    {"max", true, TRK_CHOICE_MAX, ControlKind::kConstant},
-    {"affine robust", true, TRK_CHOICE_ROBUST, ControlKind::kAffine},
-    {"affine mean", true, TRK_CHOICE_MEAN, ControlKind::kAffine},
-    {"trilinear robust", true, TRK_CHOICE_ROBUST, ControlKind::kTrilinear},
-    {"trilinear mean", true, TRK_CHOICE_MEAN, ControlKind::kTrilinear}};
+    {"ratio", TRK_METHOD_RATIO},
+    {"robust"},
+    {"mean", TRK_METHOD_RESIDUAL, TRK_CHOICE_MEAN},
+    {"min", TRK_METHOD_RESIDUAL, TRK_CHOICE_MIN},
+    {"max", TRK_METHOD_RESIDUAL, TRK_CHOICE_MAX},
+    {"affine robust", TRK_METHOD_RESIDUAL, TRK_CHOICE_ROBUST, ControlKind::kAffine},
+    {"affine mean", TRK_METHOD_RESIDUAL, TRK_CHOICE_MEAN, ControlKind::kAffine},
+    {"trilinear robust", TRK_METHOD_RESIDUAL, TRK_CHOICE_ROBUST, ControlKind::kTrilinear},
+    {"trilinear mean", TRK_METHOD_RESIDUAL, TRK_CHOICE_MEAN, ControlKind::kTrilinear},
+    {"delta", TRK_METHOD_DELTA},
+    {"ratio, rms", TRK_METHOD_RATIO, TRK_CHOICE_ROBUST, ControlKind::kConstant, RateBase::kRms, 3},
+    {"robust, rms", TRK_METHOD_RESIDUAL, TRK_CHOICE_ROBUST, ControlKind::kConstant, RateBase::kRms,
+     3},
+    {"affine robust, rms", TRK_METHOD_RESIDUAL, TRK_CHOICE_ROBUST, ControlKind::kAffine,
+     RateBase::kRms, 3},
+    {"trilinear robust, rms", TRK_METHOD_RESIDUAL, TRK_CHOICE_ROBUST, ControlKind::kTrilinear,
+     RateBase::kRms, 3}};
+
+/// Those over the whole volume as one super-voxel.
+inline const std::vector<Way> kGlobalWays{{"global delta", TRK_METHOD_DELTA, TRK_CHOICE_ROBUST,
+                                           ControlKind::kConstant, RateBase::kMajorant, 1, true},
+                                          {"global ratio", TRK_METHOD_RATIO, TRK_CHOICE_ROBUST,
+                                           ControlKind::kConstant, RateBase::kMajorant, 1, true},
+                                          {"global robust", TRK_METHOD_RESIDUAL, TRK_CHOICE_ROBUST,
+                                           ControlKind::kConstant, RateBase::kMajorant, 1, true},
+                                          {"global mean", TRK_METHOD_RESIDUAL, TRK_CHOICE_MEAN,
+                                           ControlKind::kConstant, RateBase::kMajorant, 1, true},
+                                          {"global min", TRK_METHOD_RESIDUAL, TRK_CHOICE_MIN,
+                                           ControlKind::kConstant, RateBase::kMajorant, 1, true},
+                                          {"global max", TRK_METHOD_RESIDUAL, TRK_CHOICE_MAX,
+                                           ControlKind::kConstant, RateBase::kMajorant, 1, true},
+                                          {"global mean, rms", TRK_METHOD_RESIDUAL, TRK_CHOICE_MEAN,
+                                           ControlKind::kConstant, RateBase::kRms, 3, true}};
+
+inline Way wayNamed(const std::string& name) {
+    for (const std::vector<Way>* ways : {&kWays, &kGlobalWays}) {
+        for (const Way& way : *ways) {
+            if (way.name == name) {
+                return way;
+            }
+        }
+    }
+    ADD_FAILURE() << "no way is named " << name;
+    return {};
+}
 
 /// z beyond which one of `comparisons` true hypotheses falls with probability 0.01 [Sidak 1967].
 inline double sidakBound(size_t comparisons) {
@@ -67,13 +111,15 @@ struct PreparedRay {
 struct Scene {
     trk::Volume volume;
     Way way;
+    double depth;  ///< the mean one
     std::vector<PreparedRay> rays;
 
     Scene(const std::string& vdb, const std::string& sidecar, const Way& chosen, double meanDepth,
           size_t count, const std::array<float, 3>& color = {{1, 1, 1}})
-        : way(chosen) {
+        : way(chosen), depth(meanDepth) {
         trk::VolumeOptions options;
         options.choice = way.choice;
+        options.global = way.global;
         options.color = color;
         const trk::Volume unscaled = trk::openVolume(vdb.c_str(), "", options);
         rays = prepare(unscaled, count);
@@ -115,10 +161,11 @@ struct Scene {
                 ray.direction[a] = static_cast<float>(v[a]);
             }
             ray.tMax = rays::kInfinity;
-            PreparedRay prepared;
-            if (!volume.clip(ray, volume.field.box(), prepared.local, prepared.lengthPerVoxel)) {
+            const auto clipped = volume.clip(ray, volume.field.box());
+            if (!clipped) {
                 continue;
             }
+            PreparedRay prepared{clipped->local, clipped->lengthPerVoxel, {}};
             prepared.exactDepth = exactDepthOf(volume, prepared);
             if (prepared.exactDepth[0] > 0) {
                 result.push_back(prepared);
@@ -130,7 +177,7 @@ struct Scene {
     /// From the cells, not from the moments it is compared through.
     static std::array<double, 3> exactDepthOf(const trk::Volume& volume, const PreparedRay& ray) {
         std::array<double, 3> result{};
-        trk::withVariant(volume, true, [&](auto variant) {
+        trk::withVariant(volume, ControlKind::kConstant, [&](auto variant) {
             using V = decltype(variant);
             trk::PathCost cost;
             const auto depth = trk::exactOpticalDepth(typename V::Extinction(volume), ray.local,
@@ -143,7 +190,40 @@ struct Scene {
     trk::TrackingSettings settings(const PreparedRay& ray) const {
         trk::TrackingSettings s;
         s.lengthPerVoxel = ray.lengthPerVoxel;
+        s.rateBase = way.rateBase;
+        s.rate = way.rate;
+        s.roulette = false;       // moments are known without
+        s.exactFallback = false;  // where it sets in, nothing random is left to test
         return s;
+    }
+
+    /// Calls body(Variant, extinction, super-voxels) for the volume.
+    template <class Body>
+    void withFields(const Body& body) const {
+        const bool controlMatters = way.method == TRK_METHOD_RESIDUAL;
+        trk::withVariant(volume, controlMatters ? volume.tracked().kind() : ControlKind::kConstant,
+                         [&](auto variant) {
+                             using V = decltype(variant);
+                             body(variant, typename V::Extinction(volume),
+                                  typename V::Walk{volume.tracked()});
+                         });
+    }
+
+    /// One estimate by the scene's way, per channel, those that are not there 0.
+    std::array<double, 3> estimate(const PreparedRay& ray, const trk::TrackingSettings& s,
+                                   trk::Rng& rng, trk::PathCost& cost) const {
+        std::array<double, 3> result{};
+        withFields([&](auto, const auto& field, const auto& superVoxels) {
+            const auto estimate =
+                way.method == TRK_METHOD_DELTA
+                    ? trk::trackBinary(field, superVoxels, ray.local, s, rng, cost)
+                : way.method == TRK_METHOD_RATIO ? trk::trackTransmittance<trk::NoControl>(
+                                                       field, superVoxels, ray.local, s, rng, cost)
+                                                 : trk::trackTransmittance<trk::ResidualControl>(
+                                                       field, superVoxels, ray.local, s, rng, cost);
+            std::copy(estimate.begin(), estimate.end(), result.begin());
+        });
+        return result;
     }
 };
 
@@ -155,7 +235,6 @@ struct Moments {
     double third = 0;   ///< third cumulant
     double fourth = 0;  ///< fourth cumulant
     double lookups = 0;
-    double exactLength = 0;
     double length = 0;
 };
 
@@ -163,35 +242,27 @@ template <class V, class Method>
 Moments momentsOf(const Scene& scene, const PreparedRay& ray, size_t channel) {
     const trk::TrackingSettings settings = scene.settings(ray);
     const typename V::Extinction field(scene.volume);
-    const typename V::Walk superVoxels{scene.volume.superVoxels};
+    const typename V::Walk superVoxels{scene.volume.tracked()};
     const LocalRay& r = ray.local;
     const double unit = settings.lengthPerVoxel;
-    const double cellsPerVoxel =
-        std::fabs(r.direction[0]) + std::fabs(r.direction[1]) + std::fabs(r.direction[2]);
     double logMoment[5] = {0, 0, 0, 0, 0};
     Moments m;
     m.length = r.tEnd;
     superVoxels.walk(r, 0, r.tEnd, [&](const auto& v, double t0, double t1) {
         double rate = 0;
         for (size_t c = 0; c < V::kChannels; ++c) {
-            rate = std::max(rate, Method::bound(v, c));
+            rate = std::max(rate, Method::rate(v, c, settings.rateBase));
         }
-        const bool hasResidual = Method::bound(v, channel) > 0;
-        const double expected = rate * unit * (t1 - t0);
-        const bool exact = expected > 2 * (1 + cellsPerVoxel * (t1 - t0));
+        const bool hasResidual = Method::rate(v, channel, settings.rateBase) > 0;
+        rate *= settings.rate;
         const auto extinction = [&](double t) { return field.extinction(r.at(t))[channel]; };
-        if (exact || !hasResidual) {
-            const double depth =
-                exact ? reference::integrateCells(r.origin, r.direction, t0, t1, extinction)
-                      : Method::integrate(v, channel, r, t0, t1);
+        m.lookups += rate * unit * (t1 - t0);
+        if (!hasResidual) {
             for (int p = 1; p <= 4; ++p) {
-                logMoment[p] -= p * unit * depth;
+                logMoment[p] -= p * unit * Method::integrate(v, channel, r, t0, t1);
             }
-            m.exactLength += exact ? t1 - t0 : 0;
-            m.lookups += exact ? 2 * cellsPerVoxel * (t1 - t0) : expected;
             return true;
         }
-        m.lookups += expected;
         for (int p = 1; p <= 4; ++p) {
             logMoment[p] +=
                 unit * reference::integrateCells(r.origin, r.direction, t0, t1, [&](double t) {
@@ -213,12 +284,28 @@ Moments momentsOf(const Scene& scene, const PreparedRay& ray, size_t channel) {
     return m;
 }
 
-inline Moments momentsOf(const Scene& scene, const PreparedRay& ray, size_t channel = 0) {
+/// Moments of a number that is 1 with probability T and else 0, T from the cells.
+inline Moments binaryMoments(const Scene& scene, const PreparedRay& ray, size_t channel) {
     Moments m;
-    trk::withVariant(scene.volume, scene.way.residual, [&](auto variant) {
+    const double T = std::exp(-Scene::exactDepthOf(scene.volume, ray)[channel]);
+    m.length = ray.local.tEnd;
+    m.transmittance = T;
+    m.variance = T * (1 - T);
+    m.third = m.variance * (1 - 2 * T);
+    m.fourth = m.variance * (1 - 6 * m.variance);
+    return m;
+}
+
+inline Moments momentsOf(const Scene& scene, const PreparedRay& ray, size_t channel = 0) {
+    if (scene.way.method == TRK_METHOD_DELTA) {
+        return binaryMoments(scene, ray, channel);
+    }
+    Moments m;
+    scene.withFields([&](auto variant, const auto&, const auto&) {
         using V = decltype(variant);
-        m = scene.way.residual ? momentsOf<V, trk::ResidualControl>(scene, ray, channel)
-                               : momentsOf<V, trk::NoControl>(scene, ray, channel);
+        m = scene.way.method == TRK_METHOD_RESIDUAL
+                ? momentsOf<V, trk::ResidualControl>(scene, ray, channel)
+                : momentsOf<V, trk::NoControl>(scene, ray, channel);
     });
     return m;
 }
@@ -237,7 +324,6 @@ struct TestSet {
     uint64_t samples = 0;
     std::vector<TestRay> rays;
     double testedShare = 1;  ///< of the rays' length
-    double exactShare = 0;   ///< of the whole rays' length
     double skewness = 0;
     double excessKurtosis = 0;
     double wholeKurtosis = 0;  ///< of the sum over whole rays
@@ -275,15 +361,12 @@ struct TestSet {
 inline TestSet makeSet(const Scene& scene, uint64_t samples, size_t channel = 0) {
     TestSet whole;
     whole.samples = samples;
-    double exactLength = 0;
     double length = 0;
     for (const PreparedRay& ray : scene.rays) {
         const Moments m = momentsOf(scene, ray, channel);
-        exactLength += m.exactLength;
         length += m.length;
         whole.add(scene, ray, m, channel, 1);
     }
-    whole.exactShare = exactLength / length;
     whole.summarize();
     if (whole.isNormal()) {
         return whole;
@@ -291,7 +374,6 @@ inline TestSet makeSet(const Scene& scene, uint64_t samples, size_t channel = 0)
     constexpr double kTail = 30;
     TestSet cut;
     cut.samples = samples;
-    cut.exactShare = whole.exactShare;
     cut.wholeKurtosis = whole.excessKurtosis;
     double tested = 0;
     for (PreparedRay ray : scene.rays) {

@@ -14,6 +14,14 @@
 
 namespace fixtures {
 
+/// Whether a sanitizer slows this build down and takes memory of its own.
+inline constexpr bool kSanitized =
+#if defined(__SANITIZE_ADDRESS__) || defined(__SANITIZE_THREAD__)
+    true;
+#else
+    false;
+#endif
+
 /// A file name in this process's own temporary folder, which is removed at exit.
 std::string path(const std::string& name);
 

@@ -287,10 +287,8 @@ std::vector<trk::LocalRay> localRays(const trk::Volume& volume, size_t count) {
     trk::worldBounds(volume.indexToWorld, volume.anchor, volume.field.box(), box.lo, box.hi);
     std::vector<trk::LocalRay> result;
     for (const TrkRay& ray : rays::through(box, count, 30, 5)) {
-        trk::LocalRay local;
-        double lengthPerVoxel = 0;
-        if (volume.clip(ray, volume.field.box(), local, lengthPerVoxel)) {
-            result.push_back(local);
+        if (const auto clipped = volume.clip(ray, volume.field.box())) {
+            result.push_back(clipped->local);
         }
     }
     return result;
@@ -300,7 +298,7 @@ TEST(Control, ClosedFormsAreTheIntegralsOfWhatCollisionsSee) {
     const std::string vdb = fixtures::cloudFile(64, "color-cloud");
     for (const ControlKind kind : kVarying) {
         const trk::Volume volume = openWith(vdb, kind, 8, TRK_CHOICE_ROBUST, 40, {{1, 2, 0.5f}});
-        trk::withVariant(volume, true, [&](auto variant) {
+        trk::withVariant(volume, volume.superVoxels.kind(), [&](auto variant) {
             using V = decltype(variant);
             double largest = 0;
             size_t reduced = 0;  // super-voxels whose chosen control is less than the baked one
@@ -338,7 +336,7 @@ TEST(Control, BoundsHoldForEveryChoiceKindAndChannel) {
         for (const ControlKind kind : kVarying) {
             for (const TrkChoice choice : {TRK_CHOICE_ROBUST, TRK_CHOICE_MEAN}) {
                 const trk::Volume volume = openWith(file, kind, 8, choice, 20, {{1, 3, 0.25f}});
-                trk::withVariant(volume, true, [&](auto variant) {
+                trk::withVariant(volume, volume.superVoxels.kind(), [&](auto variant) {
                     using V = decltype(variant);
                     const typename V::Extinction field(volume);
                     for (const trk::LocalRay& ray : localRays(volume, 80)) {
@@ -425,7 +423,7 @@ TEST(Bake, EqualSuperVoxelsThatVaryAreNotMergedIntoTiles) {
     const std::string vdb = fixtures::write("pattern.vdb", {grid});
     for (const ControlKind kind : kVarying) {
         const trk::Volume volume = openWith(vdb, kind, 4, TRK_CHOICE_MEAN, 1);
-        trk::withVariant(volume, true, [&](auto variant) {
+        trk::withVariant(volume, volume.superVoxels.kind(), [&](auto variant) {
             using V = decltype(variant);
             const typename V::Extinction field(volume);
             size_t met = 0;

@@ -1,5 +1,6 @@
 /* SPDX-License-Identifier: Apache-2.0 */
-/* libtrack: transmittance of straight rays through OpenVDB volumes. The whole C API, valid C99. */
+/* libtrack: transmittance and free paths of straight rays through OpenVDB volumes. The whole C API,
+ * valid C99. */
 #ifndef TRACK_TRACK_H
 #define TRACK_TRACK_H
 
@@ -76,7 +77,10 @@ enum {
     TRK_METHOD_EXACT = 0,    /**< regular tracking: closed form per voxel cell, no noise, slowest */
     TRK_METHOD_RESIDUAL = 1, /**< residual ratio tracking, unbiased; needs a sidecar [Novak14] */
     TRK_METHOD_RATIO = 2,    /**< ratio tracking, unbiased; needs a sidecar [Novak14] */
-    TRK_METHOD_CONTROL = 3   /**< the baked control alone: biased, no noise, for level of detail */
+    TRK_METHOD_CONTROL = 3,  /**< the baked control alone: biased, no noise, for level of detail */
+    TRK_METHOD_DELTA = 4,    /**< delta tracking: unbiased, 0 or 1, most noise; needs a sidecar */
+    TRK_METHOD_MARCH = 5 /**< ray marching from a random offset: biased, noise where steps are long;
+                              the density alone */
 };
 
 /** The control of the residual method, chosen per super-voxel when a volume is opened. Sidecars
@@ -88,6 +92,14 @@ enum {
     TRK_CHOICE_MEAN = 1, /**< the mean: least variance where super-voxels are thin */
     TRK_CHOICE_MIN = 2,  /**< the minimum: no estimate above the control's transmittance */
     TRK_CHOICE_MAX = 3   /**< the maximum */
+};
+
+/** What the sampling rate of residual and ratio tracking is a multiple of, per super-voxel. */
+typedef int32_t TrkRateBase;
+enum {
+    TRK_RATE_BASE_MAJORANT = 0, /**< a bound of |residual|: weights stay within 0 and 2 */
+    TRK_RATE_BASE_RMS = 1       /**< the root mean square of the residual: fewer look-ups, put where
+                                     they lower variance most; weights may be negative */
 };
 
 /** What opening a volume checks of its sidecar. */
@@ -111,6 +123,9 @@ typedef struct TrkVolumeOptions {
                              Tints a density of one channel, which then has three unless all
                              agree; a channel of 0 has a transmittance of exactly 1 */
     TrkChoice choice;   /**< control of TRK_METHOD_RESIDUAL */
+    uint32_t global;    /**< 1: random methods take the whole volume for one super-voxel, with a
+                             constant control and bounds of its own, whatever was baked: for
+                             comparison; 0: the super-voxels as baked */
     TrkCheck check;     /**< how far to distrust the sidecar */
     uint32_t repair;    /**< TRK_REPAIR_… bits; those the sidecar was baked with are added */
     uint64_t maxMemory; /**< refuse to hold more bytes than this; 0: no limit */
@@ -124,6 +139,7 @@ static inline TrkVolumeOptions trkDefaultVolumeOptions(void) {
     options.scale = 1.0f;
     options.color[0] = options.color[1] = options.color[2] = 1.0f;
     options.choice = TRK_CHOICE_ROBUST;
+    options.global = 0;
     options.check = TRK_CHECK_FULL;
     options.repair = 0;
     options.maxMemory = 0;
@@ -133,9 +149,14 @@ static inline TrkVolumeOptions trkDefaultVolumeOptions(void) {
 
 /** Bits of TrkQuery.flags. */
 enum {
-    /** Integrate a super-voxel exactly where tracking it would take more look-ups. On by default.
-     */
-    TRK_QUERY_EXACT_FALLBACK = 1
+    /** Integrate a super-voxel exactly where that is faster than tracking it. On by default. */
+    TRK_QUERY_EXACT_FALLBACK = 1,
+    /** End a walk early, without bias, where its product of weights is below 1/16: with
+        probability product x 16 it goes on, and counts for 1/16. On by default. */
+    TRK_QUERY_ROULETTE = 2,
+    /** Fill TrkFreePath.extinction. On by default; without, decomposition tracking saves the
+     * look-up where the control collided. */
+    TRK_QUERY_EXTINCTION = 4
 };
 
 /** What to ask. Fill it with trkDefaultQuery(), then change what you need. A result depends on the
@@ -143,16 +164,19 @@ enum {
  * and batches, any threads, any split. Give different streams to different volumes or path segments
  * that share ray ids: their estimates are then independent and may be multiplied. */
 typedef struct TrkQuery {
-    size_t size;         /**< sizeof(TrkQuery) */
-    TrkMethod method;    /**< default TRK_METHOD_RESIDUAL */
-    uint32_t samples;    /**< estimates averaged per ray, >= 1; methods without noise ignore it */
-    float rate;          /**< multiplies the sampling rate of residual and ratio; > 0. Any rate is
-                              unbiased: more look-ups, less variance */
-    uint32_t level;      /**< of TRK_METHOD_CONTROL: 0 the baked super-voxels, k 2^k larger ones */
-    uint32_t flags;      /**< TRK_QUERY_… bits */
-    uint64_t seed;       /**< of the random numbers */
-    uint64_t stream;     /**< see above */
-    uint64_t firstRayId; /**< ray i has id firstRayId + i, unless rayIds is given */
+    size_t size;          /**< sizeof(TrkQuery) */
+    TrkMethod method;     /**< default TRK_METHOD_RESIDUAL */
+    uint32_t samples;     /**< estimates averaged per ray, >= 1; methods without noise ignore it */
+    float rate;           /**< multiplies the sampling rate: more look-ups, less variance. > 0; any
+                               is unbiased. Of delta and free paths it multiplies the majorant, and
+                               must be >= 1 */
+    TrkRateBase rateBase; /**< of residual and ratio */
+    float step;           /**< of TRK_METHOD_MARCH: voxel lengths between look-ups; >= 0.001 */
+    uint32_t level;       /**< of TRK_METHOD_CONTROL: 0 the baked super-voxels, k 2^k larger ones */
+    uint32_t flags;       /**< TRK_QUERY_… bits */
+    uint64_t seed;        /**< of the random numbers */
+    uint64_t stream;      /**< see above */
+    uint64_t firstRayId;  /**< ray i has id firstRayId + i, unless rayIds is given */
     const uint64_t* rayIds; /**< one id a ray, or NULL */
     size_t rayStride;       /**< bytes from one TrkRay to the next; 0: sizeof(TrkRay) */
     int32_t threads;        /**< 0: all, 1: the calling thread alone, n: at most n */
@@ -164,8 +188,10 @@ static inline TrkQuery trkDefaultQuery(void) {
     query.method = TRK_METHOD_RESIDUAL;
     query.samples = 1;
     query.rate = 1.0f;
+    query.rateBase = TRK_RATE_BASE_MAJORANT;
+    query.step = 1.0f;
     query.level = 0;
-    query.flags = TRK_QUERY_EXACT_FALLBACK;
+    query.flags = TRK_QUERY_EXACT_FALLBACK | TRK_QUERY_ROULETTE | TRK_QUERY_EXTINCTION;
     query.seed = 0;
     query.stream = 0;
     query.firstRayId = 0;
@@ -222,6 +248,21 @@ TRK_API void trkCloseVolume(TrkVolume* volume);
 /** Fills *info, whose size the caller has set. Thread-safe. */
 TRK_API TrkStatus trkGetVolumeInfo(const TrkVolume* volume, TrkVolumeInfo* info);
 
+/** A random free path. For channel k with extinction mu_k and transmittance T_k along the ray, and
+ *  any function f of t: E[weight[k] f(t), where t is finite] is the integral of T_k mu_k f over the
+ *  ray, and E[weight[k], where t is infinite] is the T_k of the whole ray. So a path tracer
+ *  multiplies its throughput by weight x albedo where the path collides, by weight where it
+ * escapes.
+ */
+typedef struct TrkFreePath {
+    float t;         /**< where it collides, in the ray's own parameter; +infinity: it escapes */
+    float weight[3]; /**< per channel; a grey volume has 1 in all three. They sum to 3, so that
+                          none is larger, and are not negative */
+    float extinction[3]; /**< there, per channel, in 1/world unit; all alike in a grey volume, 0
+                              where the path escapes, and without TRK_QUERY_EXTINCTION */
+    uint32_t lookups;    /**< density values interpolated */
+} TrkFreePath;
+
 /* ---- Query ----------------------------------------------------------------------------------- */
 
 /** Estimates the transmittance of rayCount rays.
@@ -240,6 +281,24 @@ TRK_API TrkStatus trkEstimateTransmittance(const TrkVolume* volume, const TrkQue
 TRK_API TrkStatus trkIntegrateOpticalDepth(const TrkVolume* volume, const TrkQuery* query,
                                            const TrkRay* rays, size_t rayCount,
                                            double* opticalDepth);
+
+/** Samples one free path for each of rayCount rays: where a photon collides, and with what weight.
+ *  query->method: TRK_METHOD_RESIDUAL for decomposition tracking (default; the minimum of each
+ * super-voxel is a control whose collisions take no look-up) or TRK_METHOD_DELTA for delta
+ * tracking. Both have the same distribution. In colour, one path serves all channels, with a weight
+ * each (spectral tracking) [Kutz17]. query->samples must be 1; for several paths of a ray give
+ * different streams or ray ids. A free path is independent of the transmittance estimates of the
+ * same ray, stream and seed. results: room for rayCount records. Otherwise as
+ * trkEstimateTransmittance. */
+TRK_API TrkStatus trkSampleFreePath(const TrkVolume* volume, const TrkQuery* query,
+                                    const TrkRay* rays, size_t rayCount, TrkFreePath* results);
+
+/** Interpolates the extinction at pointCount points of world space, in the calling thread.
+ *  points: x, y, z, finite, pointStride bytes apart; 0: 3 floats. extinction: room for `channels`
+ * floats a point, in 1/world unit; 0 outside the volume. Fails with INVALID_ARGUMENT (naming the
+ * first bad point) or NO_DENSITY before any result is written. Thread-safe. */
+TRK_API TrkStatus trkSampleExtinction(const TrkVolume* volume, const float* points,
+                                      size_t pointStride, size_t pointCount, float* extinction);
 
 #ifdef __cplusplus
 }

@@ -63,6 +63,18 @@ class Volume {
         check(trkIntegrateOpticalDepth(handle_, &query, rays, rayCount, opticalDepth));
     }
 
+    /// As trkSampleFreePath: one record a ray. Throws Error.
+    void sampleFreePath(const TrkQuery& query, const TrkRay* rays, size_t rayCount,
+                        TrkFreePath* results) const {
+        check(trkSampleFreePath(handle_, &query, rays, rayCount, results));
+    }
+
+    /// As trkSampleExtinction, of points x, y, z without gaps: `channels` floats a point. Throws
+    /// Error.
+    void sampleExtinction(const float* points, size_t pointCount, float* extinction) const {
+        check(trkSampleExtinction(handle_, points, 0, pointCount, extinction));
+    }
+
   private:
     Volume() = default;
     static void check(TrkStatus status) {

@@ -2,8 +2,9 @@
 // Regular tracking: the optical depth in closed form, cell by cell.
 #pragma once
 
-#include "../sparse_table.h"
-#include "path_cost.h"
+#include "tracking.h"
+
+#include <array>
 
 namespace trk {
 

@@ -2,18 +2,18 @@
 // Residual ratio tracking and ratio tracking over super-voxels [Novak14].
 #pragma once
 
-#include "path_cost.h"
 #include "scaled_product.h"
+#include "tracking.h"
 
-#include "../sparse_table.h"
-
+#include <algorithm>
 #include <array>
+#include <cmath>
 #include <cstddef>
 
 namespace trk {
 
 /// Which part of the extinction is integrated analytically, and at what rate the rest is sampled:
-/// a control and a bound of what it leaves, both in extinction, per channel.
+/// a control, and a bound or root mean square of what it leaves, all in extinction, per channel.
 struct ResidualControl {
     template <class SuperVoxel>
     static double control(const SuperVoxel& v, size_t channel, const Vec3d& point) {
@@ -25,8 +25,9 @@ struct ResidualControl {
         return v.integrateControl(channel, ray, t0, t1);
     }
     template <class SuperVoxel>
-    static double bound(const SuperVoxel& v, size_t channel) {
-        return static_cast<double>(v[channel].bound);
+    static double rate(const SuperVoxel& v, size_t channel, RateBase base) {
+        return static_cast<double>(base == RateBase::kRms ? v[channel].residualRms
+                                                          : v[channel].bound);
     }
 };
 
@@ -40,24 +41,56 @@ struct NoControl {
     template <class SuperVoxel>
     static double integrate(const SuperVoxel& v, size_t channel, const LocalRay&, double t0,
                             double t1) {
-        return isHomogeneous(v, channel) ? static_cast<double>(v[channel].baked) * (t1 - t0) : 0.0;
+        return v[channel].isHomogeneous() ? static_cast<double>(v[channel].min) * (t1 - t0) : 0.0;
     }
     template <class SuperVoxel>
-    static double bound(const SuperVoxel& v, size_t channel) {
-        return isHomogeneous(v, channel) ? 0.0 : static_cast<double>(v[channel].max);
-    }
-
-  private:
-    template <class SuperVoxel>
-    static bool isHomogeneous(const SuperVoxel& v, size_t channel) {
-        return v[channel].baked == v[channel].max;
+    static double rate(const SuperVoxel& v, size_t channel, RateBase base) {
+        return v[channel].isHomogeneous()
+                   ? 0.0
+                   : static_cast<double>(base == RateBase::kRms ? v[channel].rms : v[channel].max);
     }
 };
 
-struct TrackingSettings {
-    double lengthPerVoxel = 1;  ///< world length of one voxel length along the ray
-    double rate = 1;            ///< multiplies the bound
-    bool exactFallback = true;
+/// Below this, the product of weights and control so far cannot matter, and the walk goes on only
+/// with probability product / threshold, the product raised to the threshold if it does (Russian
+/// roulette). An estimate then has a second moment larger by at most threshold x T x (what the rest
+/// of the ray's estimate has as second moment over its mean), which for ratio tracking is at most
+/// threshold x T.
+constexpr double kRouletteThreshold = 0x1p-4;
+
+/// The weights of C channels on their way.
+template <size_t C>
+struct Throughput {
+    std::array<ScaledProduct, C> products;
+    std::array<double, C> opticalDepth{};  ///< integrated so far
+
+    bool isZero() const {
+        return std::all_of(products.begin(), products.end(),
+                           [](const ScaledProduct& p) { return p.isZero(); });
+    }
+    /// Whether the walk goes on.
+    template <class Random>
+    bool survives(Random& random) {
+        const double logThreshold = std::log(kRouletteThreshold);
+        for (size_t c = 0; c < C; ++c) {
+            if (products[c].logBound() - opticalDepth[c] > logThreshold) {
+                return true;
+            }
+        }
+        double largest = 0;
+        for (size_t c = 0; c < C; ++c) {
+            largest = std::max(largest, std::fabs(products[c].timesExp(opticalDepth[c])));
+        }
+        const double probability = largest / kRouletteThreshold;
+        if (!(1 - random.uniform() <= probability)) {  // at least 2^-53 where it holds
+            products.fill(ScaledProduct::zero());
+            return false;
+        }
+        for (ScaledProduct& product : products) {
+            product.multiply(1 / probability);
+        }
+        return true;
+    }
 };
 
 /// One estimate of the transmittance of the whole ray, per channel:
@@ -73,61 +106,62 @@ std::array<double, Field::kChannels> trackTransmittance(const Field& field,
                                                         const TrackingSettings& settings,
                                                         Random& random, PathCost& cost) {
     constexpr size_t C = Field::kChannels;
-    std::array<ScaledProduct, C> products;
-    std::array<double, C> opticalDepth{};
+    Throughput<C> sofar;
     // Optical distance (in units of the rate) to the next collision; carried over from one
     // super-voxel to the next, as the exponential distribution has no memory: one logarithm a
     // look-up, none where there is none.
     double distance = random.exponential();
-    const double cellsPerVoxel =
-        std::fabs(ray.direction[0]) + std::fabs(ray.direction[1]) + std::fabs(ray.direction[2]);
     superVoxels.walk(ray, 0, ray.tEnd, [&](const auto& v, double tEnter, double tExit) {
         ++cost.superVoxels;
-        double bound = Method::bound(v, 0);
+        double base = Method::rate(v, 0, settings.rateBase);
         for (size_t c = 1; c < C; ++c) {
-            bound = std::max(bound, Method::bound(v, c));
+            base = std::max(base, Method::rate(v, c, settings.rateBase));
         }
-        const double rate = bound * settings.rate;
+        // Where nothing is random, neither is whether the walk goes on.
+        if (settings.roulette && base > 0 && !sofar.survives(random)) {
+            return false;
+        }
+        const double rate = base * settings.rate;
         const double ratePerVoxel = rate * settings.lengthPerVoxel;
         double remaining = ratePerVoxel * (tExit - tEnter);
-        // Decided from the expected number of collisions, not the drawn one, which would be bias.
-        if (settings.exactFallback && remaining > 2 * (1 + cellsPerVoxel * (tExit - tEnter))) {
+        if (settings.exactFallback && remaining > exactCost(ray, tExit - tEnter)) {
             uint64_t bricks = 0;
             const auto exact = field.integrate(ray, tEnter, tExit, cost.lookups, bricks);
             for (size_t c = 0; c < C; ++c) {
-                opticalDepth[c] += settings.lengthPerVoxel * exact[c];
+                sofar.opticalDepth[c] += settings.lengthPerVoxel * exact[c];
             }
             cost.exactLength += tExit - tEnter;
             return true;
-        }
-        for (size_t c = 0; c < C; ++c) {
-            opticalDepth[c] +=
-                settings.lengthPerVoxel * Method::integrate(v, c, ray, tEnter, tExit);
         }
         while (distance < remaining) {
             remaining -= distance;
             const Vec3d point = ray.at(tExit - remaining / ratePerVoxel);
             const auto extinction = field.extinction(point);
-            bool allZero = true;
             for (size_t c = 0; c < C; ++c) {
                 // A channel without residual here keeps its weight to the bit.
-                if (C == 1 || Method::bound(v, c) > 0) {
-                    products[c].multiply(1 - (extinction[c] - Method::control(v, c, point)) / rate);
+                if (C == 1 || Method::rate(v, c, settings.rateBase) > 0) {
+                    sofar.products[c].multiply(1 - (extinction[c] - Method::control(v, c, point)) /
+                                                       rate);
                 }
-                allZero = allZero && products[c].isZero();
             }
             ++cost.lookups;
-            if (allZero) {
+            // This super-voxel's control is not in the throughput yet: it may still be needed to
+            // outweigh collisions that amplify.
+            if (settings.roulette ? !sofar.survives(random) : sofar.isZero()) {
                 return false;
             }
             distance = random.exponential();
         }
         distance -= remaining;
+        for (size_t c = 0; c < C; ++c) {
+            sofar.opticalDepth[c] +=
+                settings.lengthPerVoxel * Method::integrate(v, c, ray, tEnter, tExit);
+        }
         return true;
     });
     std::array<double, C> result;
     for (size_t c = 0; c < C; ++c) {
-        result[c] = products[c].timesExp(opticalDepth[c]);
+        result[c] = sofar.products[c].timesExp(sofar.opticalDepth[c]);
     }
     return result;
 }

@@ -3,6 +3,8 @@
 #pragma once
 
 #include <cmath>
+#include <cstdint>
+#include <cstring>
 #include <limits>
 
 namespace trk {
@@ -11,6 +13,12 @@ namespace trk {
 /// extreme while what they make together is not, so the exponents meet before anything is rounded.
 class ScaledProduct {
   public:
+    static ScaledProduct zero() {
+        ScaledProduct product;
+        product.value_ = 0;
+        return product;
+    }
+
     void multiply(double weight) {
         value_ *= weight;
         const double magnitude = std::fabs(value_);
@@ -23,10 +31,19 @@ class ScaledProduct {
 
     bool isZero() const { return value_ == 0; }
 
+    /// A number that the logarithm of |product| does not exceed, and not by more than ln 2 (unless
+    /// the product is 0), for less than a logarithm.
+    double logBound() const {
+        uint64_t bits;
+        std::memcpy(&bits, &value_, sizeof(bits));
+        const auto exponent = static_cast<int64_t>(bits >> 52 & 0x7ff) - 1022;
+        return static_cast<double>(exponent_ + exponent) * kLn2;
+    }
+
     /// product x exp(-opticalDepth), saturated at the range of float instead of infinite.
     double timesExp(double opticalDepth) const {
         constexpr double kLimit = static_cast<double>(std::numeric_limits<float>::max());
-        const double logScale = static_cast<double>(exponent_) * 0.69314718055994530942;
+        const double logScale = static_cast<double>(exponent_) * kLn2;
         // Beyond +-1400 the exponential decides alone: |value_| lies within 2^+-500.
         const double power = std::fmin(std::fmax(logScale - opticalDepth, -1400.0), 1400.0);
         const double result = value_ * std::exp(0.5 * power) * std::exp(0.5 * power);
@@ -34,8 +51,10 @@ class ScaledProduct {
     }
 
   private:
+    static constexpr double kLn2 = 0.69314718055994530942;
+
     double value_ = 1;
-    long long exponent_ = 0;
+    int64_t exponent_ = 0;
 };
 
 }  // namespace trk

@@ -1,0 +1,76 @@
+// SPDX-License-Identifier: Apache-2.0
+// What queries of many rays share: checking them before any result is written, and running them.
+#pragma once
+
+#include "estimators/tracking.h"
+#include "track/track.h"
+#include "volume.h"
+
+#include <tbb/blocked_range.h>
+#include <tbb/parallel_for.h>
+#include <tbb/task_arena.h>
+
+#include <algorithm>
+#include <cstddef>
+#include <cstdint>
+
+namespace trk {
+
+inline const TrkRay& rayAt(const TrkQuery& query, const TrkRay* rays, size_t i) {
+    return *reinterpret_cast<const TrkRay*>(reinterpret_cast<const unsigned char*>(rays) +
+                                            i * query.rayStride);
+}
+
+inline uint64_t rayIdAt(const TrkQuery& query, size_t i) {
+    return query.rayIds ? query.rayIds[i] : query.firstRayId + i;
+}
+
+inline TrackingSettings trackingSettings(const TrkQuery& query, double lengthPerVoxel) {
+    TrackingSettings settings;
+    settings.lengthPerVoxel = lengthPerVoxel;
+    settings.rate = static_cast<double>(query.rate);
+    settings.rateBase = query.rateBase == TRK_RATE_BASE_RMS ? RateBase::kRms : RateBase::kMajorant;
+    settings.exactFallback = (query.flags & TRK_QUERY_EXACT_FALLBACK) != 0;
+    settings.roulette = (query.flags & TRK_QUERY_ROULETTE) != 0;
+    settings.wantsExtinction = (query.flags & TRK_QUERY_EXTINCTION) != 0;
+    return settings;
+}
+
+/// Throws Error naming the first ray that is none.
+void checkRays(const TrkQuery& query, const TrkRay* rays, size_t rayCount);
+
+/// Throw Error, saying how to get it, where the volume has no density, or no super-voxels.
+void requireDensity(const Volume& volume);
+void requireSuperVoxels(const Volume& volume);
+
+/// Runs body(i) for every ray: in this thread for one ray or one thread, else over TBB.
+template <class Body>
+void forEachRay(const TrkQuery& query, size_t rayCount, const Body& body) {
+    if (rayCount == 1 || query.threads == 1) {
+        for (size_t i = 0; i < rayCount; ++i) {
+            body(i);
+        }
+        return;
+    }
+    const auto run = [&] {
+        // Isolated: a thread that waits here must not pick up a task of the caller's, who may hold
+        // locks.
+        tbb::this_task_arena::isolate([&] {
+            tbb::parallel_for(tbb::blocked_range<size_t>(0, rayCount, 64),
+                              [&](const tbb::blocked_range<size_t>& range) {
+                                  for (size_t i = range.begin(); i != range.end(); ++i) {
+                                      body(i);
+                                  }
+                              });
+        });
+    };
+    if (query.threads == 0) {
+        run();
+    } else {
+        // More than the machine has would only make TBB print a warning.
+        const int most = tbb::this_task_arena::max_concurrency();
+        tbb::task_arena(std::min(query.threads, most)).execute(run);
+    }
+}
+
+}  // namespace trk

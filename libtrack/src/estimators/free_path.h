@@ -1,0 +1,257 @@
+// SPDX-License-Identifier: Apache-2.0
+// Where a photon collides: delta tracking and decomposition tracking, in grey and in colour, and
+// the binary transmittance that delta tracking makes of it.
+#pragma once
+
+#include "tracking.h"
+
+#include <algorithm>
+#include <array>
+#include <cmath>
+#include <cstddef>
+
+namespace trk {
+
+/// A free path. For every channel c and function f, E[weight_c f(t), collided] is the integral of
+/// T_c mu_c f over the ray, and E[weight_c, not collided] is T_c of the whole ray.
+template <size_t C>
+struct FreePath {
+    FreePath() { weight.fill(1); }
+
+    bool collided = false;
+    double t = 0;  ///< where, in voxel lengths
+    std::array<double, C> weight;
+    std::array<double, C>
+        extinction{};  ///< there, where that was wanted; 0 where it did not collide
+};
+
+namespace detail {
+
+/// One channel of a field, and of super-voxels, as a grey one.
+template <class Field>
+struct OneChannelField {
+    static constexpr size_t kChannels = 1;
+    const Field& field;
+    size_t channel;
+
+    std::array<double, 1> extinction(const Vec3d& point) const {
+        return {{field.extinction(point)[channel]}};
+    }
+    std::array<double, 1> integrate(const LocalRay& ray, double t0, double t1, uint64_t& lookups,
+                                    uint64_t& regions) const {
+        return {{field.integrate(ray, t0, t1, lookups, regions)[channel]}};
+    }
+    template <class Visit>
+    void forEachCell(const LocalRay& ray, double t0, double t1, Visit&& visit) const {
+        field.forEachCell(ray, t0, t1, [&](double tEnter, double tExit, const auto& depth) {
+            return visit(tEnter, tExit, std::array<double, 1>{{depth[channel]}});
+        });
+    }
+};
+template <class SuperVoxels>
+struct OneChannelWalk {
+    const SuperVoxels& superVoxels;
+    size_t channel;
+
+    template <class Visit>
+    void walk(const LocalRay& ray, double t0, double t1, Visit&& visit) const {
+        superVoxels.walk(ray, t0, t1, [&](const auto& v, double tEnter, double tExit) {
+            return visit(&v[channel], tEnter, tExit);
+        });
+    }
+};
+
+/// Regular tracking over [t0, t1]: the collision, if there is one, at the point where the optical
+/// depth reaches an exponential number. In colour, that of one channel, chosen in proportion to the
+/// weights, which then become those of the mixture of all channels.
+template <class Field, class Random>
+void sampleExactly(const Field& field, const LocalRay& ray, double t0, double t1,
+                   double lengthPerVoxel, Random& random, PathCost& cost,
+                   FreePath<Field::kChannels>& path) {
+    constexpr size_t C = Field::kChannels;
+    std::array<double, C> share{{1}};  // of the mixture
+    size_t chosen = 0;
+    if constexpr (C > 1) {
+        double sum = 0;
+        for (const double w : path.weight) {
+            sum += std::fabs(w);
+        }
+        double u = random.uniform() * sum;
+        for (size_t c = 0; c < C; ++c) {
+            share[c] = std::fabs(path.weight[c]) / sum;
+        }
+        while (chosen + 1 < C && u >= std::fabs(path.weight[chosen])) {
+            u -= std::fabs(path.weight[chosen++]);
+        }
+    }
+    const double target = random.exponential() / lengthPerVoxel;
+    std::array<double, C> depth{};
+    double tEnd = t1;
+    field.forEachCell(ray, t0, t1, [&](double tEnter, double tExit, const auto& cell) {
+        cost.lookups += 2;
+        if (depth[chosen] + cell[chosen] <= target) {
+            for (size_t c = 0; c < C; ++c) {
+                depth[c] += cell[c];
+            }
+            return true;
+        }
+        // Newton's method on a function that only grows, kept inside by bisection.
+        double lo = tEnter;
+        double hi = tExit;
+        double t = tEnter + (tExit - tEnter) * (target - depth[chosen]) / cell[chosen];
+        std::array<double, C> part{};
+        for (int i = 0; i < 60 && hi - lo > 1e-12 * (1 + tExit); ++i) {
+            uint64_t regions = 0;
+            part = field.integrate(ray, tEnter, t, cost.lookups, regions);
+            const double missing = target - depth[chosen] - part[chosen];
+            (missing > 0 ? lo : hi) = t;
+            const double slope = field.extinction(ray.at(t))[chosen];
+            ++cost.lookups;
+            const double next = t + missing / slope;
+            if (std::fabs(missing) <= 1e-12 * (target + cell[chosen])) {
+                break;
+            }
+            t = next > lo && next < hi ? next : 0.5 * (lo + hi);
+        }
+        for (size_t c = 0; c < C; ++c) {
+            depth[c] += part[c];
+        }
+        path.collided = true;
+        tEnd = t;
+        return false;
+    });
+    cost.exactLength += tEnd - t0;
+    path.t = tEnd;
+    if (path.collided) {
+        path.extinction = field.extinction(ray.at(tEnd));
+        ++cost.lookups;
+    }
+    if constexpr (C > 1) {
+        // Relative to the chosen channel, lest all underflow.
+        std::array<double, C> density;
+        double mixture = 0;
+        for (size_t c = 0; c < C; ++c) {
+            density[c] = std::exp(lengthPerVoxel * (depth[chosen] - depth[c])) *
+                         (path.collided ? path.extinction[c] : 1.0);
+            mixture += share[c] * density[c];
+        }
+        for (size_t c = 0; c < C && mixture > 0; ++c) {
+            path.weight[c] *= density[c] / mixture;
+        }
+    }
+}
+
+}  // namespace detail
+
+/// Samples a free path. With kDecompose, the minimum of each super-voxel is a control whose
+/// collisions need no look-up, and only the rest is tracked [Kutz17]; without, it is delta tracking
+/// [Woodcock65]. Homogeneous super-voxels need no look-up in either.
+///
+/// In grey, both take the same decisions from the same random numbers: what decomposition saves is
+/// the look-up where a collision is the control's, if the extinction there is not wanted.
+///
+/// Tentative collisions come at a rate that covers every channel. In grey they are real with
+/// probability extinction / rate, and the weight stays 1. In colour they are real with the
+/// probability that the channels have together, each by its weight so far, and the weights make up
+/// for the difference (spectral tracking); their sum is kept, so none exceeds C [Kutz17].
+template <bool kDecompose, class Field, class SuperVoxels, class Random>
+FreePath<Field::kChannels> sampleFreePath(const Field& field, const SuperVoxels& superVoxels,
+                                          const LocalRay& ray, const TrackingSettings& settings,
+                                          Random& random, PathCost& cost) {
+    constexpr size_t C = Field::kChannels;
+    FreePath<C> path;
+    double distance = random.exponential();  // in units of the rate; see trackTransmittance
+    superVoxels.walk(ray, 0, ray.tEnd, [&](const auto& v, double tEnter, double tExit) {
+        ++cost.superVoxels;
+        std::array<double, C> control;
+        double controlRate = 0;
+        double residualRate = 0;
+        double mean = 0;
+        for (size_t c = 0; c < C; ++c) {
+            control[c] = kDecompose || v[c].isHomogeneous() ? static_cast<double>(v[c].min) : 0.0;
+            controlRate = std::max(controlRate, control[c]);
+            residualRate = std::max(residualRate, static_cast<double>(v[c].max) - control[c]);
+            mean += static_cast<double>(v[c].baked) / C;
+        }
+        residualRate *= settings.rate;
+        const double rate = controlRate + residualRate;
+        const double ratePerVoxel = rate * settings.lengthPerVoxel;
+        const double voxels = tExit - tEnter;
+        // Look-ups end with the first collision: there are about (rate / mean) before it.
+        const double expected = residualRate * settings.lengthPerVoxel * voxels /
+                                (1 + mean * settings.lengthPerVoxel * voxels);
+        if (settings.exactFallback && expected > exactCost(ray, voxels)) {
+            detail::sampleExactly(field, ray, tEnter, tExit, settings.lengthPerVoxel, random, cost,
+                                  path);
+            return !path.collided;
+        }
+        double remaining = ratePerVoxel * voxels;
+        while (distance < remaining) {
+            remaining -= distance;
+            distance = random.exponential();
+            path.t = tExit - remaining / ratePerVoxel;
+            const double u = residualRate > 0 ? random.uniform() * rate : 0.0;
+            const bool ofControl = u < controlRate;
+            std::array<double, C> extinction = control;
+            if (!ofControl) {
+                extinction = field.extinction(ray.at(path.t));
+                ++cost.lookups;
+            }
+            if constexpr (C == 1) {
+                path.collided = ofControl || u - controlRate < extinction[0] - control[0];
+            } else {
+                const double part = ofControl ? controlRate : residualRate;
+                std::array<double, C> real;
+                double realSum = 0;
+                double sum = 0;
+                for (size_t c = 0; c < C; ++c) {
+                    real[c] = ofControl ? control[c] : extinction[c] - control[c];
+                    realSum += std::fabs(path.weight[c] * real[c]);
+                    sum += std::fabs(path.weight[c] * real[c]) +
+                           std::fabs(path.weight[c] * (part - real[c]));
+                }
+                const double probability = realSum / sum;
+                path.collided = random.uniform() < probability;
+                for (size_t c = 0; c < C; ++c) {
+                    path.weight[c] *= path.collided ? real[c] / (part * probability)
+                                                    : (part - real[c]) / (part * (1 - probability));
+                }
+            }
+            if (path.collided) {
+                if (ofControl && residualRate > 0 && settings.wantsExtinction) {
+                    extinction = field.extinction(ray.at(path.t));
+                    ++cost.lookups;
+                }
+                path.extinction = extinction;
+                return false;
+            }
+        }
+        distance -= remaining;
+        return true;
+    });
+    return path;
+}
+
+/// One estimate of the transmittance of the whole ray by delta tracking, per channel: whether a
+/// photon passes, 1 or 0. Each channel takes a walk of its own.
+template <class Field, class SuperVoxels, class Random>
+std::array<double, Field::kChannels> trackBinary(const Field& field, const SuperVoxels& superVoxels,
+                                                 const LocalRay& ray,
+                                                 const TrackingSettings& settings, Random& random,
+                                                 PathCost& cost) {
+    constexpr size_t C = Field::kChannels;
+    if constexpr (C == 1) {
+        const auto path = sampleFreePath<false>(field, superVoxels, ray, settings, random, cost);
+        return {{path.collided ? 0.0 : 1.0}};
+    } else {
+        std::array<double, C> result;
+        for (size_t c = 0; c < C; ++c) {
+            const detail::OneChannelField<Field> oneField{field, c};
+            const detail::OneChannelWalk<SuperVoxels> oneWalk{superVoxels, c};
+            result[c] = trackBinary(oneField, oneWalk, ray, settings, random, cost)[0];
+        }
+        return result;
+    }
+}
+
+}  // namespace trk

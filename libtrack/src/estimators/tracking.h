@@ -1,0 +1,41 @@
+// SPDX-License-Identifier: Apache-2.0
+// What the random walks share: how they are set, what they spent, when they had better integrate.
+#pragma once
+
+#include "../sparse_table.h"
+
+#include <cmath>
+#include <cstdint>
+
+namespace trk {
+
+/// What an estimator spent on a ray.
+struct PathCost {
+    uint64_t lookups = 0;      ///< density values interpolated
+    uint64_t superVoxels = 0;  ///< occupied regions met
+    double exactLength = 0;    ///< voxel lengths integrated exactly
+};
+
+/// What the rate of collisions is a multiple of: a bound of what is sampled, or its root mean
+/// square.
+enum class RateBase { kMajorant, kRms };
+
+struct TrackingSettings {
+    double lengthPerVoxel = 1;  ///< world length of one voxel length along the ray
+    double rate = 1;            ///< multiplies the base
+    RateBase rateBase = RateBase::kMajorant;
+    bool exactFallback = true;
+    bool roulette = true;         ///< of transmittance: see kRouletteThreshold
+    bool wantsExtinction = true;  ///< of free paths: where they collide
+};
+
+/// How many random look-ups take as long as integrating voxel lengths exactly: half a one a cell,
+/// whose values lie side by side (measured; see method.md). Whether a walk takes more is decided
+/// from its expected number, not the drawn one, which would be bias.
+inline double exactCost(const LocalRay& ray, double voxels) {
+    const double cellsPerVoxel =
+        std::fabs(ray.direction[0]) + std::fabs(ray.direction[1]) + std::fabs(ray.direction[2]);
+    return 0.5 * (1 + cellsPerVoxel * voxels);
+}
+
+}  // namespace trk

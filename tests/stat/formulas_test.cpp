@@ -1,0 +1,300 @@
+// SPDX-License-Identifier: Apache-2.0
+// The formulas for variance and look-ups, met by the estimators on analytic media: no VDB, no
+// bake. And that what is homogeneous costs no look-up and has no noise, in real volumes.
+#include "estimators/exact.h"
+#include "estimators/free_path.h"
+#include "estimators/ratio_tracking.h"
+#include "estimators/ray_marching.h"
+#include "rng.h"
+#include "support/fixtures.h"
+#include "support/rays.h"
+#include "track/track.h"
+#include "variant.h"
+#include "volume.h"
+
+#include <gtest/gtest.h>
+
+#include <array>
+#include <cmath>
+#include <cstdint>
+#include <cstdio>
+#include <functional>
+#include <string>
+#include <vector>
+
+namespace {
+
+using trk::LocalRay;
+using trk::SuperVoxel;
+using trk::Vec3d;
+
+/// Extinction from `first` at x = 0, linearly to `last` at x = length.
+struct Ramp {
+    static constexpr size_t kChannels = 1;
+    double first;
+    double last;
+    double length;
+
+    std::array<double, 1> extinction(const Vec3d& point) const {
+        return {{first + (last - first) * point[0] / length}};
+    }
+    std::array<double, 1> integrate(const LocalRay&, double t0, double t1, uint64_t&,
+                                    uint64_t&) const {
+        return {{(t1 - t0) * extinction({{0.5 * (t0 + t1), 0, 0}})[0]}};
+    }
+    template <class Visit>
+    void forEachCell(const LocalRay& ray, double t0, double t1, Visit&& visit) const {
+        uint64_t ignored = 0;
+        visit(t0, t1, integrate(ray, t0, t1, ignored, ignored));
+    }
+    template <class Visit>
+    void forEachRegion(const LocalRay&, double t0, double t1, Visit&& visit) const {
+        visit(static_cast<const std::array<double, 1>*>(nullptr), t0, t1);
+    }
+    double depth() const { return 0.5 * length * (first + last); }
+    /// Integral of (extinction - control)^2.
+    double squares(double control) const {
+        const double a = first - control;
+        const double b = last - control;
+        return length * (a * a + a * b + b * b) / 3;
+    }
+    LocalRay ray() const { return {{{0, 0, 0}}, {{1, 0, 0}}, {{1, 1e300, 1e300}}, length}; }
+};
+
+/// One super-voxel over everything.
+struct Everywhere {
+    SuperVoxel item;
+
+    template <class Visit>
+    void walk(const LocalRay& ray, double, double, Visit&& visit) const {
+        const trk::Int3 anywhere{{0, 0, 0}};
+        visit(trk::SuperVoxelView<1, trk::ControlKind::kConstant>(&item, nullptr, anywhere, 1), 0.0,
+              ray.tEnd);
+    }
+};
+
+struct Measured {
+    double mean = 0;
+    double variance = 0;
+    double lookups = 0;  ///< a sample
+};
+
+template <class Estimate>
+Measured measure(uint64_t samples, const Estimate& estimate) {
+    double sum = 0;
+    double squares = 0;
+    trk::PathCost cost;
+    for (uint64_t i = 0; i < samples; ++i) {
+        trk::Rng rng(5, 6, 7, i);
+        const double value = estimate(rng, cost);
+        sum += value;
+        squares += value * value;
+    }
+    const auto n = static_cast<double>(samples);
+    return {sum / n, squares / n - sum / n * (sum / n), static_cast<double>(cost.lookups) / n};
+}
+
+void expectFormula(const char* what, const Measured& found, double transmittance,
+                   double relativeVariance, double lookups) {
+    const double relative = found.variance / (transmittance * transmittance);
+    std::printf("%-34s relative variance %.4f, formula %.4f; look-ups %.4f, formula %.4f\n", what,
+                relative, relativeVariance, found.lookups, lookups);
+    EXPECT_NEAR(found.mean, transmittance, 0.01 * transmittance) << what;
+    EXPECT_NEAR(relative, relativeVariance, 0.05 * relativeVariance) << what;
+    EXPECT_NEAR(found.lookups, lookups, 0.05 * lookups) << what;
+}
+
+constexpr uint64_t kSamples = 400000;
+
+/// Each method on a medium whose super-voxel says min to max, against the formulas.
+void expectFormulas(const std::string& name, const Ramp& medium, double min, double max,
+                    double control) {
+    const LocalRay ray = medium.ray();
+    const double T = std::exp(-medium.depth());
+    Everywhere super{};
+    super.item.min = static_cast<float>(min);
+    super.item.max = static_cast<float>(max);
+    super.item.baked = super.item.control = static_cast<float>(control);
+    super.item.bound = static_cast<float>(std::max(max - control, control - min));
+    super.item.rms = static_cast<float>(std::sqrt(medium.squares(0) / medium.length));
+    super.item.residualRms = static_cast<float>(std::sqrt(medium.squares(control) / medium.length));
+    trk::TrackingSettings settings;
+    settings.exactFallback = false;
+    settings.roulette = false;
+    for (const trk::RateBase base : {trk::RateBase::kMajorant, trk::RateBase::kRms}) {
+        for (const double multiplier : {1.0, 2.0}) {
+            settings.rateBase = base;
+            settings.rate = multiplier;
+            char label[80];
+            const bool rms = base == trk::RateBase::kRms;
+            std::snprintf(label, sizeof(label), "%s, %g x %s, ratio", name.c_str(), multiplier,
+                          rms ? "rms" : "majorant");
+            double rate = multiplier * static_cast<double>(rms ? super.item.rms : super.item.max);
+            const Measured ratio = measure(kSamples, [&](trk::Rng& rng, trk::PathCost& cost) {
+                return trk::trackTransmittance<trk::NoControl>(medium, super, ray, settings, rng,
+                                                               cost)[0];
+            });
+            expectFormula(label, ratio, T, std::expm1(medium.squares(0) / rate),
+                          rate * medium.length);
+
+            std::snprintf(label, sizeof(label), "%s, %g x %s, residual", name.c_str(), multiplier,
+                          rms ? "rms" : "majorant");
+            rate =
+                multiplier * static_cast<double>(rms ? super.item.residualRms : super.item.bound);
+            const Measured residual = measure(kSamples, [&](trk::Rng& rng, trk::PathCost& cost) {
+                return trk::trackTransmittance<trk::ResidualControl>(medium, super, ray, settings,
+                                                                     rng, cost)[0];
+            });
+            expectFormula(label, residual, T, std::expm1(medium.squares(control) / rate),
+                          rate * medium.length);
+        }
+    }
+    settings.rateBase = trk::RateBase::kMajorant;
+    for (const double multiplier : {1.0, 2.0}) {
+        settings.rate = multiplier;
+        const Measured delta = measure(kSamples, [&](trk::Rng& rng, trk::PathCost& cost) {
+            return trk::trackBinary(medium, super, ray, settings, rng, cost)[0];
+        });
+        // Tentative collisions up to the real one: the integral of rate x T.
+        const double rate = multiplier * max;
+        double lookups = 0;
+        constexpr int kSteps = 10000;
+        for (int i = 0; i < kSteps; ++i) {
+            const double t = (i + 0.5) * medium.length / kSteps;
+            const double depth =
+                t * medium.first + 0.5 * t * t * (medium.last - medium.first) / medium.length;
+            lookups += rate * std::exp(-depth) * medium.length / kSteps;
+        }
+        const std::string label =
+            name + ", delta x " + std::to_string(static_cast<int>(multiplier));
+        expectFormula(label.c_str(), delta, T, 1 / T - 1, lookups);
+        if (medium.first == medium.last) {
+            EXPECT_NEAR(lookups, rate / medium.first * (1 - T), 1e-4 * lookups);
+        }
+    }
+}
+
+TEST(Formulas, HoldOnAHomogeneousSlab) {
+    // Majorants 2 and 4 times the extinction, at optical depths of 1 and 2.
+    expectFormulas("slab, kappa 2, depth 1", {0.1, 0.1, 10}, 0, 0.2, 0.06);
+    expectFormulas("slab, kappa 4, depth 2", {0.2, 0.2, 10}, 0, 0.8, 0.3);
+}
+
+TEST(Formulas, HoldOnARamp) {
+    expectFormulas("ramp, depth 1", {0.02, 0.18, 10}, 0.02, 0.18, 0.1);
+    expectFormulas("ramp, depth 2", {0.4, 0.0, 10}, 0, 0.5, 0.2);
+}
+
+TEST(Formulas, RatioOverDeltaIsThePredictedOne) {
+    // Variance x cost, homogeneous: tau T (e^(tau / kappa) - 1) / (1 - T)^2.
+    struct Case {
+        double kappa;
+        double depth;
+        double predicted;
+    };
+    for (const Case& c : {Case{2, 1, 0.60}, Case{4, 4, 0.13}}) {
+        const Ramp medium{0.1 * c.depth, 0.1 * c.depth, 10};
+        const double T = std::exp(-c.depth);
+        const double formula = c.depth * T * std::expm1(c.depth / c.kappa) / ((1 - T) * (1 - T));
+        EXPECT_NEAR(formula, c.predicted, 0.005);
+        Everywhere super{};
+        super.item.max = static_cast<float>(c.kappa * medium.first);
+        trk::TrackingSettings settings;
+        settings.exactFallback = false;
+        settings.roulette = false;
+        const Measured ratio = measure(kSamples, [&](trk::Rng& rng, trk::PathCost& cost) {
+            return trk::trackTransmittance<trk::NoControl>(medium, super, medium.ray(), settings,
+                                                           rng, cost)[0];
+        });
+        const Measured delta = measure(kSamples, [&](trk::Rng& rng, trk::PathCost& cost) {
+            return trk::trackBinary(medium, super, medium.ray(), settings, rng, cost)[0];
+        });
+        const double found = ratio.variance * ratio.lookups / (delta.variance * delta.lookups);
+        std::printf(
+            "kappa %g, depth %g: variance x look-ups of ratio over delta %.3f, formula "
+            "%.3f\n",
+            c.kappa, c.depth, found, formula);
+        EXPECT_NEAR(found, formula, 0.05 * formula);
+    }
+}
+
+TEST(Formulas, MarchingIsUnbiasedInOpticalDepthAndBiasedByHalfItsVariance) {
+    // On 10 voxels of a ramp, steps of 4 make an optical depth that is noisy.
+    const Ramp medium{0.02, 0.18, 10};
+    const auto depthOf = [&](trk::Rng& rng, trk::PathCost& cost) {
+        return trk::marchOpticalDepth(medium, medium.ray(), 1, 4, rng, cost)[0];
+    };
+    const Measured depth = measure(kSamples, depthOf);
+    const Measured T = measure(kSamples, [&](trk::Rng& rng, trk::PathCost& cost) {
+        return std::exp(-depthOf(rng, cost));
+    });
+    const double n = static_cast<double>(kSamples);
+    EXPECT_NEAR(depth.mean, medium.depth(), 5 * std::sqrt(depth.variance / n));
+    EXPECT_NEAR(depth.lookups, 2.5, 0.01);
+    const double bias = T.mean / std::exp(-medium.depth()) - 1;
+    std::printf("variance of the optical depth %.4f, relative bias of the transmittance %.4f\n",
+                depth.variance, bias);
+    EXPECT_GT(bias, 10 * std::sqrt(T.variance / n) / T.mean);
+    EXPECT_NEAR(bias, 0.5 * depth.variance, 0.1 * bias);
+}
+
+/// A tile, and beside it voxels of another value that fill super-voxels, so that rays along x cross
+/// homogeneous super-voxels of two kinds.
+struct HomogeneousFiles {
+    std::string vdb;
+    std::string sidecar;
+};
+HomogeneousFiles homogeneous() {
+    openvdb::initialize();
+    auto grid = openvdb::FloatGrid::create();
+    grid->setName("density");
+    grid->tree().addTile(1, openvdb::Coord(0, 0, 0), 0.05f, true);
+    grid->denseFill(openvdb::CoordBBox(8, -8, -8, 47, 47, 47), 0.03f);
+    const HomogeneousFiles files{fixtures::write("homogeneous.vdb", {grid}),
+                                 fixtures::path("homogeneous.track.vdb")};
+    fixtures::bake(files.vdb, files.sidecar, 8);
+    return files;
+}
+
+TEST(Analytic, HomogeneousSuperVoxelsTakeNoLookupAndHaveNoNoise) {
+    const HomogeneousFiles files = homogeneous();
+    trk::VolumeOptions options;
+    options.scale = 4;
+    const trk::Volume volume = trk::openVolume(files.vdb.c_str(), files.sidecar.c_str(), options);
+    // From x = 16 to 40, within what is 0.03 everywhere: depth 4 x 0.03 x 24.
+    const TrkRay ray{{0, 20.3f, 19.1f}, 16, {1, 0, 0}, 40};
+    const auto clipped = volume.clip(ray, volume.field.box());
+    ASSERT_TRUE(clipped);
+    const double T = std::exp(-4 * static_cast<double>(0.03f) * 24);
+    using V = trk::Variant<1, 1, trk::ControlKind::kConstant>;
+    const V::Extinction field(volume);
+    const V::Walk superVoxels{volume.superVoxels};
+    trk::TrackingSettings settings;
+    settings.lengthPerVoxel = clipped->lengthPerVoxel;
+    double binary = 0;
+    constexpr uint64_t kCount = 20000;
+    for (uint64_t i = 0; i < kCount; ++i) {
+        trk::Rng rng(1, 2, 3, i);
+        trk::PathCost cost;
+        const LocalRay& local = clipped->local;
+        const double ratio = trk::trackTransmittance<trk::NoControl>(field, superVoxels, local,
+                                                                     settings, rng, cost)[0];
+        const double residual = trk::trackTransmittance<trk::ResidualControl>(
+            field, superVoxels, local, settings, rng, cost)[0];
+        const double marched = std::exp(
+            -trk::marchOpticalDepth(field, local, settings.lengthPerVoxel, 2.7, rng, cost)[0]);
+        const double exact =
+            std::exp(-trk::exactOpticalDepth(field, local, settings.lengthPerVoxel, cost)[0]);
+        for (const double found : {ratio, residual, marched, exact}) {
+            ASSERT_NEAR(found, T, 1e-9);
+        }
+        binary += trk::trackBinary(field, superVoxels, local, settings, rng, cost)[0];
+        const auto path = trk::sampleFreePath<true>(field, superVoxels, local, settings, rng, cost);
+        ASSERT_TRUE(!path.collided || path.extinction[0] == 4 * static_cast<double>(0.03f));
+        ASSERT_EQ(cost.lookups, 0u);
+    }
+    // Delta tracking answers 0 or 1 even here.
+    EXPECT_NEAR(binary / kCount, T, 5 * std::sqrt(T * (1 - T) / kCount));
+}
+
+}  // namespace

@@ -23,6 +23,8 @@ int main(int argc, char** argv) {
     TrkRay ray = {{0.0f, 0.0f, 0.0f}, 0.0f, {1.0f, 0.0f, 0.0f}, INFINITY};
     TrkStatistics statistics;
     float transmittance = -1.0f;
+    float extinction = -1.0f;
+    TrkFreePath path;
     double depth = -1.0;
     int a;
 
@@ -57,6 +59,13 @@ int main(int argc, char** argv) {
     expect(
         depth > 0.0 && fabs(exp(-depth) - transmittance) < 6 * statistics.standardError[0] + 1e-6,
         "the estimate is near the exact value");
+    query = trkDefaultQuery();
+    expect(trkSampleFreePath(volume, &query, &ray, 1, &path) == TRK_OK, "trkSampleFreePath");
+    expect(path.weight[0] == 1.0f && path.weight[2] == 1.0f, "a grey volume's weights are 1");
+    expect(isinf(path.t) ? path.extinction[0] == 0.0f : path.extinction[0] > 0.0f,
+           "extinction where it collides");
+    expect(trkSampleExtinction(volume, ray.origin, 0, 1, &extinction) == TRK_OK && extinction > 0,
+           "trkSampleExtinction");
     trkCloseVolume(volume);
     trkCloseVolume(NULL);
 

@@ -243,17 +243,20 @@ case_query_output() {
     awk -F, 'NR > 1 && ($2 < 0 || $2 > 1 || $3 != 0 || $4 < 0) { exit 1 }' stdout ||
         fail "exact rows: $(cat stdout)"
     cp stdout exact.csv
-    for method in residual ratio; do
-        for choice in robust mean min max; do
-            expect 0 query cloud.vdb --rays rays.csv --method $method --choice $choice \
-                --samples 4000
+    for method in "residual --choice robust" "residual --choice mean" "residual --choice min" \
+        "residual --choice max" "residual --rate-base rms --rate 3" "residual --no-roulette" \
+        ratio "ratio --global" "residual --global" "ratio --rate-base rms --rate 2" \
+        delta "delta --global --rate 2" "march --step 0.05"; do
+            # shellcheck disable=SC2086
+            expect 0 query cloud.vdb --rays rays.csv --method $method --samples 4000
             # Within 5 standard errors of the exact value (two misses have an error of 0).
             paste -d, exact.csv stdout | awk -F, 'NR > 1 {
                 d = $2 - $7; if (d < 0) d = -d
                 if (d > 5 * $8 + 1e-6 || $9 != "") { print; exit 1 } }' >bad ||
-                fail "$method $choice: $(cat bad)"
-        done
+                fail "$method: $(cat bad)"
     done
+    expect 0 query cloud.vdb --rays rays.csv --method delta --samples 1
+    awk -F, 'NR > 1 && $2 != 0 && $2 != 1 { exit 1 }' stdout || fail "delta: $(cat stdout)"
     expect 0 query cloud.vdb --rays rays.csv --samples 1
     awk -F, 'NR > 1 && ($3 != "" || $4 != "") { exit 1 }' stdout || fail "one sample: $(cat stdout)"
     expect 0 query cloud.vdb --rays rays.csv --method control --level 2
@@ -269,6 +272,38 @@ case_query_output() {
     cmp -s stdout out.csv && fail "another stream, the same results"
     expect 0 query cloud.vdb --rays rays.csv --scale 0
     awk -F, 'NR > 1 && $2 != 1 { exit 1 }' stdout || fail "scale 0: $(cat stdout)"
+}
+
+case_free_paths() {
+    baked_cloud
+    some_rays
+    for method in residual delta "residual --global"; do
+        # shellcheck disable=SC2086
+        expect 0 query cloud.vdb --rays rays.csv --free-paths --method $method --scale 2
+        [ "$(head -n 1 stdout)" = "ray,t,weight,extinction,lookups" ] || fail "header"
+        [ "$(sed -n 4p stdout)" = "2,inf,1,0,0" ] || fail "a miss: $(sed -n 4p stdout)"
+        awk -F, 'NR > 1 && ($3 != 1 || ($2 == "inf") != ($4 == 0)) { exit 1 }' stdout ||
+            fail "$method: $(cat stdout)"
+    done
+    expect 0 query cloud.vdb --rays rays.csv --free-paths --scale 1000
+    awk -F, 'NR == 2 && ($2 == "inf" || $4 <= 0) { exit 1 }' stdout || fail "dense: $(cat stdout)"
+    expect 0 query cloud.vdb --rays rays.csv --free-paths --color 1,2,0.5
+    contains stdout "ray,t,weight_r,weight_g,weight_b,extinction_r,extinction_g,extinction_b,lookups"
+    wrong() {
+        local text=$1
+        shift
+        expect 2 query cloud.vdb --rays rays.csv "$@"
+        contains stderr "$text"
+    }
+    wrong "--free-paths: expected --method residual" --free-paths --method ratio
+    wrong "--samples: of no use with --free-paths" --free-paths --samples 4
+    wrong "--rate: expected a finite number >= 1" --free-paths --rate 0.5
+    wrong "--rate: expected a finite number >= 1" --method delta --rate 0.5
+    wrong "--level: of no use with --method ratio" --method ratio --level 1
+    wrong "--step: of no use with --method exact" --method exact --step 2
+    wrong "--step: expected a finite number of voxels" --method march --step 0
+    wrong "--rate-base: of no use with --method delta" --method delta --rate-base rms
+    wrong "rate-base" --rate-base loudest
 }
 
 case_bad_rays() {

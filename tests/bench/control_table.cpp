@@ -33,17 +33,14 @@ double timeRays(const Row& row, uint64_t seed) {
     constexpr int kSamples = 20;
     double sum = 0;
     const auto start = std::chrono::steady_clock::now();
-    row.scene->withFields([&](auto, const auto& field, const auto& superVoxels) {
-        trk::PathCost cost;
-        for (size_t i = 0; i < row.scene->rays.size(); ++i) {
-            const PreparedRay& ray = row.scene->rays[i];
-            for (int k = 0; k < kSamples; ++k) {
-                trk::Rng rng(seed, 0, i, static_cast<uint64_t>(k));
-                sum += trk::trackTransmittance<trk::ResidualControl>(
-                    field, superVoxels, ray.local, row.scene->settings(ray), rng, cost)[0];
-            }
+    trk::PathCost cost;
+    for (size_t i = 0; i < row.scene->rays.size(); ++i) {
+        const PreparedRay& ray = row.scene->rays[i];
+        for (int k = 0; k < kSamples; ++k) {
+            trk::Rng rng(seed, 0, i, static_cast<uint64_t>(k));
+            sum += row.scene->estimate(ray, row.scene->settings(ray), rng, cost)[0];
         }
-    });
+    }
     const std::chrono::duration<double> elapsed = std::chrono::steady_clock::now() - start;
     if (!(sum < 1e30)) {  // keeps the estimates from being optimised away
         std::fprintf(stderr, "unexpected sum %g\n", sum);

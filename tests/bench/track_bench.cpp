@@ -141,6 +141,27 @@ void estimate(benchmark::State& state, TrkMethod method, const Case& measured) {
     state.counters["mse"] = squares / static_cast<double>(out.size() * state.iterations());
 }
 
+/// Free paths by decomposition or delta tracking; look-ups as counter.
+void samplePaths(benchmark::State& state, TrkMethod method, const Case& measured) {
+    Set& set = makeSet(measured);
+    TrkQuery query = singleThreaded(method);
+    std::vector<TrkFreePath> out(set.rays.size());
+    double lookups = 0;
+    for (auto ignored : state) {
+        ++query.seed;
+        set.volume->sampleFreePath(query, set.rays.data(), set.rays.size(), out.data());
+        state.PauseTiming();
+        for (const TrkFreePath& path : out) {
+            lookups += path.lookups;
+        }
+        state.ResumeTiming();
+    }
+    const double rays = static_cast<double>(set.rays.size() * state.iterations());
+    state.counters["s/ray"] =
+        benchmark::Counter(rays, benchmark::Counter::kIsRate | benchmark::Counter::kInvert);
+    state.counters["lookups"] = lookups / rays;
+}
+
 void bakeStatistics(benchmark::State& state) {
     const trk::Density density = fixtures::load(volumeFile());
     for (auto ignored : state) {
@@ -159,10 +180,10 @@ void loadDensity(benchmark::State& state) {
 }  // namespace
 
 int main(int argc, char** argv) {
-    const std::pair<const char*, TrkMethod> methods[] = {{"exact", TRK_METHOD_EXACT},
-                                                         {"residual", TRK_METHOD_RESIDUAL},
-                                                         {"ratio", TRK_METHOD_RATIO},
-                                                         {"control", TRK_METHOD_CONTROL}};
+    const std::pair<const char*, TrkMethod> methods[] = {
+        {"exact", TRK_METHOD_EXACT}, {"residual", TRK_METHOD_RESIDUAL},
+        {"ratio", TRK_METHOD_RATIO}, {"control", TRK_METHOD_CONTROL},
+        {"delta", TRK_METHOD_DELTA}, {"march", TRK_METHOD_MARCH}};
     std::vector<Case> cases;
     for (const bool coherent : {true, false}) {
         for (const int depth : {1, 10}) {
@@ -182,6 +203,16 @@ int main(int argc, char** argv) {
             const TrkMethod m = method;
             benchmark::RegisterBenchmark((name + c.label()).c_str(), [=](benchmark::State& state) {
                 estimate(state, m, c);
+            })->Unit(benchmark::kMillisecond);
+        }
+    }
+    for (const auto& [name, method] : {std::pair{"freepath/decomposition", TRK_METHOD_RESIDUAL},
+                                       std::pair{"freepath/delta", TRK_METHOD_DELTA}}) {
+        for (const int depth : {1, 10}) {
+            const TrkMethod m = method;
+            const Case c{16, depth, false};
+            benchmark::RegisterBenchmark((name + c.label()).c_str(), [=](benchmark::State& state) {
+                samplePaths(state, m, c);
             })->Unit(benchmark::kMillisecond);
         }
     }

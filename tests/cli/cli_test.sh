@@ -201,7 +201,8 @@ case_turntable() {
     expect 1 preview cloud.track.vdb -o turn.png --frames 3 --resolution 40x30
     one_line "turn.0002.png: exists already"
     absent turn.0001.png
-    for command in "preview cloud.track.vdb -o x.png" "query cloud.vdb --rays rays.csv"; do
+    for command in "preview cloud.track.vdb -o x.png" \
+        "query cloud.vdb --rays rays.csv --method control"; do
         some_rays
         # shellcheck disable=SC2086
         expect 2 $command --level 5

@@ -1,0 +1,247 @@
+// SPDX-License-Identifier: Apache-2.0
+#include "stat/test_set.h"
+
+#include "estimators/exact.h"
+#include "estimators/free_path.h"
+#include "support/rays.h"
+#include "support/reference.h"
+
+#include <algorithm>
+#include <random>
+
+namespace estimates {
+namespace {
+
+std::vector<PreparedRay> prepare(const trk::Volume& volume, size_t count) {
+    rays::Box box{};
+    for (int a = 0; a < 3; ++a) {
+        const auto axis = static_cast<size_t>(a);
+        box.lo[a] = 0.2 * static_cast<double>(volume.field.box().hi[axis]) +
+                    0.8 * static_cast<double>(volume.field.box().lo[axis]);
+        box.hi[a] = 0.8 * static_cast<double>(volume.field.box().hi[axis]) +
+                    0.2 * static_cast<double>(volume.field.box().lo[axis]);
+    }
+    std::vector<PreparedRay> result;
+    std::mt19937_64 random(99);
+    std::uniform_real_distribution<double> unit(0, 1);
+    while (result.size() < count) {
+        const auto d = rays::unitVector(random);
+        trk::Vec3d index;
+        trk::Vec3d direction{{d[0], d[1], d[2]}};
+        for (int a = 0; a < 3; ++a) {
+            index[a] = box.lo[a] + unit(random) * (box.hi[a] - box.lo[a]) -
+                       1000 * d[static_cast<size_t>(a)] +
+                       static_cast<double>(volume.anchor[static_cast<size_t>(a)]);
+        }
+        const trk::Vec3d o = volume.indexToWorld.point(index);
+        const trk::Vec3d v = volume.indexToWorld.vector(direction);
+        TrkRay ray{};
+        for (int a = 0; a < 3; ++a) {
+            ray.origin[a] = static_cast<float>(o[a]);
+            ray.direction[a] = static_cast<float>(v[a]);
+        }
+        ray.tMax = rays::kInfinity;
+        const auto clipped = volume.clip(ray, volume.field.box());
+        if (!clipped) {
+            continue;
+        }
+        PreparedRay prepared{clipped->local, clipped->lengthPerVoxel, {}};
+        prepared.exactDepth = Scene::exactDepthOf(volume, prepared);
+        if (prepared.exactDepth[0] > 0) {
+            result.push_back(prepared);
+        }
+    }
+    return result;
+}
+
+template <class V, class Method>
+Moments momentsOf(const Scene& scene, const PreparedRay& ray, size_t channel) {
+    const trk::TrackingSettings settings = scene.settings(ray);
+    const typename V::Extinction field(scene.volume);
+    const typename V::Walk superVoxels{scene.volume.tracked()};
+    const LocalRay& r = ray.local;
+    const double unit = settings.lengthPerVoxel;
+    double logMoment[5] = {0, 0, 0, 0, 0};
+    Moments m;
+    m.length = r.tEnd;
+    superVoxels.walk(r, 0, r.tEnd, [&](const auto& v, double t0, double t1) {
+        double rate = 0;
+        for (size_t c = 0; c < V::kChannels; ++c) {
+            rate = std::max(rate, Method::rate(v, c, settings.rateBase));
+        }
+        const bool hasResidual = Method::rate(v, channel, settings.rateBase) > 0;
+        rate *= settings.rate;
+        const auto extinction = [&](double t) { return field.extinction(r.at(t))[channel]; };
+        m.lookups += rate * unit * (t1 - t0);
+        if (!hasResidual) {
+            for (int p = 1; p <= 4; ++p) {
+                logMoment[p] -= p * unit * Method::integrate(v, channel, r, t0, t1);
+            }
+            return true;
+        }
+        for (int p = 1; p <= 4; ++p) {
+            logMoment[p] +=
+                unit * reference::integrateCells(r.origin, r.direction, t0, t1, [&](double t) {
+                    const double control = Method::control(v, channel, r.at(t));
+                    const double w = 1 - (extinction(t) - control) / rate;
+                    return rate * (std::pow(w, p) - 1) - p * control;
+                });
+        }
+        return true;
+    });
+    const double T = std::exp(logMoment[1]);
+    const double m2 = std::exp(logMoment[2]);
+    const double m3 = std::exp(logMoment[3]);
+    const double m4 = std::exp(logMoment[4]);
+    m.transmittance = T;
+    m.variance = std::max(m2 - T * T, 0.0);
+    m.third = m3 - 3 * T * m2 + 2 * T * T * T;
+    m.fourth = m4 - 4 * T * m3 + 6 * T * T * m2 - 3 * T * T * T * T - 3 * m.variance * m.variance;
+    return m;
+}
+
+/// Moments of a number that is 1 with probability T and else 0, T from the cells.
+Moments binaryMoments(const Scene& scene, const PreparedRay& ray, size_t channel) {
+    Moments m;
+    const double T = std::exp(-Scene::exactDepthOf(scene.volume, ray)[channel]);
+    m.length = ray.local.tEnd;
+    m.transmittance = T;
+    m.variance = T * (1 - T);
+    m.third = m.variance * (1 - 2 * T);
+    m.fourth = m.variance * (1 - 6 * m.variance);
+    return m;
+}
+
+}  // namespace
+
+Way wayNamed(const std::string& name) {
+    for (const std::vector<Way>* ways : {&kWays, &kGlobalWays}) {
+        for (const Way& way : *ways) {
+            if (way.name == name) {
+                return way;
+            }
+        }
+    }
+    ADD_FAILURE() << "no way is named " << name;
+    return {};
+}
+
+double sidakBound(size_t comparisons) {
+    const double alpha = 1 - std::pow(0.99, 1.0 / static_cast<double>(comparisons));
+    double lo = 0;
+    double hi = 20;
+    for (int i = 0; i < 100; ++i) {
+        const double middle = 0.5 * (lo + hi);
+        (std::erfc(middle / std::sqrt(2.0)) > alpha ? lo : hi) = middle;
+    }
+    return lo;
+}
+
+Scene::Scene(const std::string& vdb, const std::string& sidecar, const Way& chosen,
+             double meanDepth, size_t count, const std::array<float, 3>& color)
+    : way(chosen), depth(meanDepth) {
+    trk::VolumeOptions options;
+    options.choice = way.choice;
+    options.global = way.global;
+    options.color = color;
+    const trk::Volume unscaled = trk::openVolume(vdb.c_str(), "", options);
+    rays = prepare(unscaled, count);
+    double sum = 0;
+    for (const PreparedRay& ray : rays) {
+        sum += ray.exactDepth[0];
+    }
+    options.scale = static_cast<float>(meanDepth * static_cast<double>(rays.size()) / sum);
+    volume = trk::openVolume(vdb.c_str(), sidecar.c_str(), options);
+    rays = prepare(volume, count);
+}
+
+std::array<double, 3> Scene::exactDepthOf(const trk::Volume& volume, const PreparedRay& ray) {
+    std::array<double, 3> result{};
+    trk::withVariant(volume, ControlKind::kConstant, [&](auto variant) {
+        using V = decltype(variant);
+        trk::PathCost cost;
+        const auto depth = trk::exactOpticalDepth(typename V::Extinction(volume), ray.local,
+                                                  ray.lengthPerVoxel, cost);
+        std::copy(depth.begin(), depth.end(), result.begin());
+    });
+    return result;
+}
+
+trk::TrackingSettings Scene::settings(const PreparedRay& ray) const {
+    trk::TrackingSettings s;
+    s.lengthPerVoxel = ray.lengthPerVoxel;
+    s.rateBase = way.rateBase;
+    s.rate = way.rate;
+    s.roulette = false;       // moments are known without
+    s.exactFallback = false;  // where it sets in, nothing random is left to test
+    return s;
+}
+
+std::array<double, 3> Scene::estimate(const PreparedRay& ray, const trk::TrackingSettings& s,
+                                      trk::Rng& rng, trk::PathCost& cost) const {
+    std::array<double, 3> result{};
+    withFields([&](auto, const auto& field, const auto& superVoxels) {
+        const auto estimate = way.method == TRK_METHOD_DELTA
+                                  ? trk::trackBinary(field, superVoxels, ray.local, s, rng, cost)
+                              : way.method == TRK_METHOD_RATIO
+                                  ? trk::trackTransmittance<trk::NoControl>(field, superVoxels,
+                                                                            ray.local, s, rng, cost)
+                                  : trk::trackTransmittance<trk::ResidualControl>(
+                                        field, superVoxels, ray.local, s, rng, cost);
+        std::copy(estimate.begin(), estimate.end(), result.begin());
+    });
+    return result;
+}
+
+Moments momentsOf(const Scene& scene, const PreparedRay& ray, size_t channel) {
+    if (scene.way.method == TRK_METHOD_DELTA) {
+        return binaryMoments(scene, ray, channel);
+    }
+    Moments m;
+    scene.withFields([&](auto variant, const auto&, const auto&) {
+        using V = decltype(variant);
+        m = scene.way.method == TRK_METHOD_RESIDUAL
+                ? momentsOf<V, trk::ResidualControl>(scene, ray, channel)
+                : momentsOf<V, trk::NoControl>(scene, ray, channel);
+    });
+    return m;
+}
+
+TestSet makeSet(const Scene& scene, uint64_t samples, size_t channel) {
+    TestSet whole;
+    whole.samples = samples;
+    double length = 0;
+    for (const PreparedRay& ray : scene.rays) {
+        const Moments m = momentsOf(scene, ray, channel);
+        length += m.length;
+        whole.add(scene, ray, m, channel, 1);
+    }
+    whole.summarize();
+    if (whole.isNormal()) {
+        return whole;
+    }
+    constexpr double kTail = 30;
+    TestSet cut;
+    cut.samples = samples;
+    cut.wholeKurtosis = whole.excessKurtosis;
+    double tested = 0;
+    for (PreparedRay ray : scene.rays) {
+        for (Moments m = momentsOf(scene, ray, channel);; m = momentsOf(scene, ray, channel)) {
+            // Below, moments are the rounding error of a difference: nothing random is left.
+            if (m.variance < 1e-7 * m.transmittance * m.transmittance) {
+                break;
+            }
+            if (m.fourth < kTail * static_cast<double>(samples) * m.variance * m.variance) {
+                tested += m.length;
+                cut.add(scene, ray, m, channel, 1 / std::sqrt(m.variance));
+                break;
+            }
+            ray.local.tEnd *= 0.8;
+        }
+    }
+    cut.testedShare = tested / length;
+    cut.summarize();
+    return cut;
+}
+
+}  // namespace estimates

@@ -330,6 +330,43 @@ TEST(Sampling, ExtinctionOutsideIsZero) {
     EXPECT_GT(out[1], 0.0f);
 }
 
+TEST(Sampling, IsBoundedWhateverTheScale) {
+    for (const char* kind : {"smoke", "color-cloud"}) {
+        const std::string vdb = fixtures::cloudFile(64, kind);
+        const std::string sidecar = fixtures::path("bounded.track.vdb");
+        fixtures::bake(vdb, sidecar, 32);
+        for (const float scale : {1e3f, 1e6f, 1e12f, 1e30f}) {
+            TrkVolumeOptions options = trkDefaultVolumeOptions();
+            options.scale = scale;
+            options.color[1] = 1e-6f;  // nearly free beside the others
+            const track::Volume volume = track::Volume::open(vdb, sidecar.c_str(), options);
+            const std::vector<TrkRay> all =
+                rays::through(rays::boundsOf(volume.info()), 500, 20, 1);
+            TrkQuery query = trkDefaultQuery();
+            for (const TrkMethod method : {TRK_METHOD_RESIDUAL, TRK_METHOD_DELTA}) {
+                query.method = method;
+                std::vector<TrkFreePath> paths(all.size());
+                volume.sampleFreePath(query, all.data(), all.size(), paths.data());
+                for (const TrkFreePath& p : paths) {
+                    ASSERT_LT(p.lookups, 2000u);
+                    for (const float w : p.weight) {
+                        ASSERT_GE(w, -1e-5f);
+                        ASSERT_LE(w, 3.0001f);
+                    }
+                    ASSERT_FALSE(std::isnan(p.t));
+                }
+                std::vector<float> transmittance(3 * all.size());
+                std::vector<TrkStatistics> statistics(all.size());
+                volume.estimateTransmittance(query, all.data(), all.size(), transmittance.data(),
+                                             statistics.data());
+                for (const TrkStatistics& s : statistics) {
+                    ASSERT_LT(s.lookups, 4000u);
+                }
+            }
+        }
+    }
+}
+
 TEST(Global, IsOneSuperVoxelForEveryKindOfBake) {
     for (const trk::ControlKind kind :
          {trk::ControlKind::kConstant, trk::ControlKind::kAffine, trk::ControlKind::kTrilinear}) {

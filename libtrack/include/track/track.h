@@ -97,9 +97,10 @@ enum {
 /** What the sampling rate of residual and ratio tracking is a multiple of, per super-voxel. */
 typedef int32_t TrkRateBase;
 enum {
-    TRK_RATE_BASE_MAJORANT = 0, /**< a bound of |residual|: weights stay within 0 and 2 */
-    TRK_RATE_BASE_RMS = 1       /**< the root mean square of the residual: fewer look-ups, put where
-                                     they lower variance most; weights may be negative */
+    TRK_RATE_BASE_MAJORANT = 0, /**< a bound of |residual|: at rate 1 weights stay within 0 and 2 */
+    TRK_RATE_BASE_RMS = 1 /**< the residual's root mean square, a quarter of the bound at least:
+                               fewer look-ups, put where they lower variance most; weights may be
+                               negative */
 };
 
 /** What opening a volume checks of its sidecar. */

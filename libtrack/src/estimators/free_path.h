@@ -9,6 +9,7 @@
 #include <array>
 #include <cmath>
 #include <cstddef>
+#include <limits>
 
 namespace trk {
 
@@ -166,25 +167,20 @@ FreePath<Field::kChannels> sampleFreePath(const Field& field, const SuperVoxels&
         std::array<double, C> control;
         double controlRate = 0;
         double residualRate = 0;
-        double mean = 0;
         for (size_t c = 0; c < C; ++c) {
             control[c] = kDecompose || v[c].isHomogeneous() ? static_cast<double>(v[c].min) : 0.0;
             controlRate = std::max(controlRate, control[c]);
             residualRate = std::max(residualRate, static_cast<double>(v[c].max) - control[c]);
-            mean += static_cast<double>(v[c].baked) / C;
         }
         residualRate *= settings.rate;
         const double rate = controlRate + residualRate;
         const double ratePerVoxel = rate * settings.lengthPerVoxel;
         const double voxels = tExit - tEnter;
-        // Look-ups end with the first collision: there are about (rate / mean) before it.
-        const double expected = residualRate * settings.lengthPerVoxel * voxels /
-                                (1 + mean * settings.lengthPerVoxel * voxels);
-        if (settings.exactFallback && expected > exactCost(ray, voxels)) {
-            detail::sampleExactly(field, ray, tEnter, tExit, settings.lengthPerVoxel, random, cost,
-                                  path);
-            return !path.collided;
-        }
+        // Where a ray meets little of what the rate covers, null collisions would never end. After
+        // as many as integrating exactly takes, that is what is done with the rest: having come so
+        // far, how to go on is free.
+        double budget = settings.exactFallback ? exactCost(ray, voxels)
+                                               : std::numeric_limits<double>::infinity();
         double remaining = ratePerVoxel * voxels;
         while (distance < remaining) {
             remaining -= distance;
@@ -224,6 +220,11 @@ FreePath<Field::kChannels> sampleFreePath(const Field& field, const SuperVoxels&
                 }
                 path.extinction = extinction;
                 return false;
+            }
+            if (--budget < 0) {
+                detail::sampleExactly(field, ray, path.t, tExit, settings.lengthPerVoxel, random,
+                                      cost, path);
+                return !path.collided;
             }
         }
         distance -= remaining;

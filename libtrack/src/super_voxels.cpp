@@ -108,6 +108,7 @@ SuperVoxels::SuperVoxels(BakedVolume baked, const std::vector<double>& scales, T
     const auto itemOf = [&](size_t i) { return baked.channels == channels ? i : i / channels; };
     const size_t count = baked.items.size() / baked.channels * channels;
     items_.reserve(count);
+    ranges_.reserve(count);
     shapes_.reserve(kind_ == ControlKind::kConstant ? 0 : count * (1 + slopeSize(kind_)));
     for (size_t i = 0; i < count; ++i) {
         const BakedSuperVoxel& item = baked.items[itemOf(i)];
@@ -119,14 +120,15 @@ SuperVoxels::SuperVoxels(BakedVolume baked, const std::vector<double>& scales, T
         const double mean = s * static_cast<double>(item.mean);
         const double deviation = s * static_cast<double>(item.deviation);
         SuperVoxel v;
+        ExtinctionRange range;
         v.baked = static_cast<float>(s * control.centre);
-        v.min = roundDown(min);
-        v.max = roundUp(max);
+        range.min = roundDown(min);
+        range.max = roundUp(max);
         double share = 1;
         double residualRms = 0;
         if (item.min == item.max) {
             // A homogeneous super-voxel keeps its value to the bit: nothing is left to track.
-            v.baked = v.control = v.min = v.max = static_cast<float>(min);
+            v.baked = v.control = range.min = range.max = static_cast<float>(min);
             v.bound = 0;
         } else if (kind_ == ControlKind::kConstant) {
             v.control = static_cast<float>(chooseControl(choice, min, mean, max, diagonal));
@@ -144,12 +146,14 @@ SuperVoxels::SuperVoxels(BakedVolume baked, const std::vector<double>& scales, T
             residualRms = share * s * static_cast<double>(item.rms) +
                           (1 - share) * std::hypot(deviation, mean - min);
         }
-        if (item.min != item.max && v.min == v.max) {  // by rounding; it would say homogeneous
-            v.max = std::nextafter(v.max, std::numeric_limits<float>::infinity());
+        if (item.min != item.max &&
+            range.min == range.max) {  // by rounding; it would say homogeneous
+            range.max = std::nextafter(range.max, std::numeric_limits<float>::infinity());
         }
         v.residualRms = rateAtLeast(residualRms, v.bound);
-        v.rms = rateAtLeast(std::hypot(deviation, mean), v.max);
+        range.rms = rateAtLeast(std::hypot(deviation, mean), range.max);
         items_.push_back(v);
+        ranges_.push_back(range);
         if (kind_ != ControlKind::kConstant) {
             shapes_.push_back(static_cast<float>(share));
             for (size_t k = 0; k < slopeSize(kind_); ++k) {
@@ -174,7 +178,7 @@ SuperVoxels::SuperVoxels(BakedVolume baked, const std::vector<double>& scales, T
 
 size_t SuperVoxels::bytes() const {
     size_t sum = table_.bytes() + items_.capacity() * sizeof(SuperVoxel) +
-                 shapes_.capacity() * sizeof(float);
+                 ranges_.capacity() * sizeof(ExtinctionRange) + shapes_.capacity() * sizeof(float);
     for (const ValueTable& level : levels_) {
         sum += level.table.bytes() + level.values.capacity() * sizeof(float);
     }

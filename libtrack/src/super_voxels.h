@@ -67,15 +67,19 @@ struct BakedVolume {
     }
 };
 
-/// What a query needs of one channel of a super-voxel, in extinction (1/world unit).
+/// What methods with a control need of one channel of a super-voxel, in extinction (1/world unit).
 struct SuperVoxel {
     float baked;        ///< the baked control at the super-voxel's centre
     float control;      ///< of the residual method, as chosen, there
-    float bound;        ///< sup |extinction - control|
+    float bound;        ///< sup |extinction - control|; 0 where the super-voxel is homogeneous
     float residualRms;  ///< root mean square of extinction - control, a quarter of bound at least
-    float min;          ///< of the extinction
-    float max;          ///< of the extinction; equal to `min` only where it is homogeneous
-    float rms;          ///< root mean square of the extinction, a quarter of max at least
+};
+
+/// What methods without need. Apart, as none needs both.
+struct ExtinctionRange {
+    float min;
+    float max;  ///< equal to `min` only where the super-voxel is homogeneous
+    float rms;  ///< root mean square of the extinction, a quarter of max at least
 
     bool isHomogeneous() const { return min == max; }
 };
@@ -84,10 +88,12 @@ struct SuperVoxel {
 template <size_t C, ControlKind K>
 class SuperVoxelView {
   public:
-    SuperVoxelView(const SuperVoxel* items, const float* shapes, const Int3& lo, double inverseSize)
-        : items_(items), shapes_(shapes), lo_(lo), inverseSize_(inverseSize) {}
+    SuperVoxelView(const SuperVoxel* items, const ExtinctionRange* ranges, const float* shapes,
+                   const Int3& lo, double inverseSize)
+        : items_(items), ranges_(ranges), shapes_(shapes), lo_(lo), inverseSize_(inverseSize) {}
 
     const SuperVoxel& operator[](size_t channel) const { return items_[channel]; }
+    const ExtinctionRange& range(size_t channel) const { return ranges_[channel]; }
 
     /// The chosen control at a point of local space.
     double control(size_t channel, const Vec3d& point) const {
@@ -151,6 +157,7 @@ class SuperVoxelView {
     }
 
     const SuperVoxel* items_;
+    const ExtinctionRange* ranges_;
     const float* shapes_;
     const Int3& lo_;
     double inverseSize_;
@@ -186,9 +193,9 @@ class SuperVoxels {
             [&](SparseTable::Entry entry, const Int3& lo, int, double tEnter, double tExit) {
                 const size_t item = SparseTable::index(entry) * C;
                 using View = SuperVoxelView<C, K>;
-                return visit(
-                    View(&items_[item], shapes_.data() + item * View::kStride, lo, inverseSize),
-                    tEnter, tExit);
+                return visit(View(&items_[item], &ranges_[item],
+                                  shapes_.data() + item * View::kStride, lo, inverseSize),
+                             tEnter, tExit);
             });
     }
 
@@ -240,6 +247,7 @@ class SuperVoxels {
     SparseTable table_;
     ControlKind kind_ = ControlKind::kConstant;
     std::vector<SuperVoxel> items_;
+    std::vector<ExtinctionRange> ranges_;
     std::vector<float> shapes_;
     std::vector<ValueTable> levels_;       // in extinction
     std::vector<IntBox> boxes_{IntBox{}};  // one a level, from 0

@@ -228,7 +228,8 @@ struct LyingSuperVoxels {
             trk::SuperVoxel item = v[0];
             item.bound = lies(item) ? 0 : item.bound;
             const trk::Int3 anywhere{{0, 0, 0}};  // a constant control is the same everywhere
-            const trk::SuperVoxelView<1, ControlKind::kConstant> view(&item, nullptr, anywhere, 1);
+            const trk::SuperVoxelView<1, ControlKind::kConstant> view(&item, nullptr, nullptr,
+                                                                      anywhere, 1);
             return visit(view, tEnter, tExit);
         });
     }

@@ -64,12 +64,14 @@ struct Ramp {
 /// One super-voxel over everything.
 struct Everywhere {
     SuperVoxel item;
+    trk::ExtinctionRange range;
 
     template <class Visit>
     void walk(const LocalRay& ray, double, double, Visit&& visit) const {
         const trk::Int3 anywhere{{0, 0, 0}};
-        visit(trk::SuperVoxelView<1, trk::ControlKind::kConstant>(&item, nullptr, anywhere, 1), 0.0,
-              ray.tEnd);
+        visit(trk::SuperVoxelView<1, trk::ControlKind::kConstant>(&item, &range, nullptr, anywhere,
+                                                                  1),
+              0.0, ray.tEnd);
     }
 };
 
@@ -112,11 +114,11 @@ void expectFormulas(const std::string& name, const Ramp& medium, double min, dou
     const LocalRay ray = medium.ray();
     const double T = std::exp(-medium.depth());
     Everywhere super{};
-    super.item.min = static_cast<float>(min);
-    super.item.max = static_cast<float>(max);
+    super.range.min = static_cast<float>(min);
+    super.range.max = static_cast<float>(max);
     super.item.baked = super.item.control = static_cast<float>(control);
     super.item.bound = static_cast<float>(std::max(max - control, control - min));
-    super.item.rms = static_cast<float>(std::sqrt(medium.squares(0) / medium.length));
+    super.range.rms = static_cast<float>(std::sqrt(medium.squares(0) / medium.length));
     super.item.residualRms = static_cast<float>(std::sqrt(medium.squares(control) / medium.length));
     trk::TrackingSettings settings;
     settings.exactFallback = false;
@@ -129,7 +131,7 @@ void expectFormulas(const std::string& name, const Ramp& medium, double min, dou
             const bool rms = base == trk::RateBase::kRms;
             std::snprintf(label, sizeof(label), "%s, %g x %s, ratio", name.c_str(), multiplier,
                           rms ? "rms" : "majorant");
-            double rate = multiplier * static_cast<double>(rms ? super.item.rms : super.item.max);
+            double rate = multiplier * static_cast<double>(rms ? super.range.rms : super.range.max);
             const Measured ratio = measure(kSamples, [&](trk::Rng& rng, trk::PathCost& cost) {
                 return trk::trackTransmittance<trk::NoControl>(medium, super, ray, settings, rng,
                                                                cost)[0];
@@ -198,7 +200,7 @@ TEST(Formulas, RatioOverDeltaIsThePredictedOne) {
         const double formula = c.depth * T * std::expm1(c.depth / c.kappa) / ((1 - T) * (1 - T));
         EXPECT_NEAR(formula, c.predicted, 0.005);
         Everywhere super{};
-        super.item.max = static_cast<float>(c.kappa * medium.first);
+        super.range.max = static_cast<float>(c.kappa * medium.first);
         trk::TrackingSettings settings;
         settings.exactFallback = false;
         settings.roulette = false;

@@ -312,8 +312,9 @@ TEST(Control, ClosedFormsAreTheIntegralsOfWhatCollisionsSee) {
                                   std::pair{t1, 1.0 / 6}}) {
                                 sum += weight * (t1 - t0) * v.control(c, ray.at(t));
                             }
-                            EXPECT_NEAR(v.integrateControl(c, ray, t0, t1), sum,
-                                        1e-9 * static_cast<double>(v[c].max) * (t1 - t0) + 1e-12);
+                            EXPECT_NEAR(
+                                v.integrateControl(c, ray, t0, t1), sum,
+                                1e-9 * static_cast<double>(v.range(c).max) * (t1 - t0) + 1e-12);
                             largest = std::max(largest, sum);
                             reduced += v[c].control < v[c].baked ? 1 : 0;
                         }

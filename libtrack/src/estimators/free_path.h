@@ -10,6 +10,7 @@
 #include <cmath>
 #include <cstddef>
 #include <limits>
+#include <type_traits>
 
 namespace trk {
 
@@ -49,6 +50,13 @@ struct OneChannelField {
         });
     }
 };
+template <class View>
+struct OneChannelView {
+    const View& view;
+    size_t channel;
+
+    const auto& range(size_t) const { return view.range(channel); }
+};
 template <class SuperVoxels>
 struct OneChannelWalk {
     const SuperVoxels& superVoxels;
@@ -57,7 +65,7 @@ struct OneChannelWalk {
     template <class Visit>
     void walk(const LocalRay& ray, double t0, double t1, Visit&& visit) const {
         superVoxels.walk(ray, t0, t1, [&](const auto& v, double tEnter, double tExit) {
-            return visit(&v[channel], tEnter, tExit);
+            return visit(OneChannelView<std::decay_t<decltype(v)>>{v, channel}, tEnter, tExit);
         });
     }
 };
@@ -168,9 +176,10 @@ FreePath<Field::kChannels> sampleFreePath(const Field& field, const SuperVoxels&
         double controlRate = 0;
         double residualRate = 0;
         for (size_t c = 0; c < C; ++c) {
-            control[c] = kDecompose || v[c].isHomogeneous() ? static_cast<double>(v[c].min) : 0.0;
+            const auto& range = v.range(c);
+            control[c] = kDecompose || range.isHomogeneous() ? static_cast<double>(range.min) : 0.0;
             controlRate = std::max(controlRate, control[c]);
-            residualRate = std::max(residualRate, static_cast<double>(v[c].max) - control[c]);
+            residualRate = std::max(residualRate, static_cast<double>(range.max) - control[c]);
         }
         residualRate *= settings.rate;
         const double rate = controlRate + residualRate;

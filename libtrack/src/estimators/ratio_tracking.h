@@ -41,13 +41,15 @@ struct NoControl {
     template <class SuperVoxel>
     static double integrate(const SuperVoxel& v, size_t channel, const LocalRay&, double t0,
                             double t1) {
-        return v[channel].isHomogeneous() ? static_cast<double>(v[channel].min) * (t1 - t0) : 0.0;
+        const auto& range = v.range(channel);
+        return range.isHomogeneous() ? static_cast<double>(range.min) * (t1 - t0) : 0.0;
     }
     template <class SuperVoxel>
     static double rate(const SuperVoxel& v, size_t channel, RateBase base) {
-        return v[channel].isHomogeneous()
+        const auto& range = v.range(channel);
+        return range.isHomogeneous()
                    ? 0.0
-                   : static_cast<double>(base == RateBase::kRms ? v[channel].rms : v[channel].max);
+                   : static_cast<double>(base == RateBase::kRms ? range.rms : range.max);
     }
 };
 
@@ -60,37 +62,53 @@ constexpr double kRouletteThreshold = 0x1p-4;
 
 /// The weights of C channels on their way.
 template <size_t C>
-struct Throughput {
-    std::array<ScaledProduct, C> products;
-    std::array<double, C> opticalDepth{};  ///< integrated so far
+class Throughput {
+  public:
+    Throughput() {
+        for (size_t c = 0; c < C; ++c) {
+            setLimit(c);
+        }
+    }
 
+    void multiply(size_t channel, double weight) {
+        products_[channel].multiply(weight);
+        setLimit(channel);
+    }
+    void integrate(size_t channel, double opticalDepth) { opticalDepth_[channel] += opticalDepth; }
+    double value(size_t channel) const {
+        return products_[channel].timesExp(opticalDepth_[channel]);
+    }
     bool isZero() const {
-        return std::all_of(products.begin(), products.end(),
+        return std::all_of(products_.begin(), products_.end(),
                            [](const ScaledProduct& p) { return p.isZero(); });
     }
     /// Whether the walk goes on.
     template <class Random>
     bool survives(Random& random) {
-        const double logThreshold = std::log(kRouletteThreshold);
-        for (size_t c = 0; c < C; ++c) {
-            if (products[c].logBound() - opticalDepth[c] > logThreshold) {
-                return true;
-            }
-        }
         double largest = 0;
         for (size_t c = 0; c < C; ++c) {
-            largest = std::max(largest, std::fabs(products[c].timesExp(opticalDepth[c])));
+            if (opticalDepth_[c] < limits_[c]) {
+                return true;
+            }
+            largest = std::max(largest, std::fabs(value(c)));
         }
         const double probability = largest / kRouletteThreshold;
         if (!(1 - random.uniform() <= probability)) {  // at least 2^-53 where it holds
-            products.fill(ScaledProduct::zero());
+            products_.fill(ScaledProduct::zero());
             return false;
         }
-        for (ScaledProduct& product : products) {
-            product.multiply(1 / probability);
+        for (size_t c = 0; c < C; ++c) {
+            multiply(c, 1 / probability);
         }
         return true;
     }
+
+  private:
+    void setLimit(size_t c) { limits_[c] = products_[c].logBound() - std::log(kRouletteThreshold); }
+
+    std::array<ScaledProduct, C> products_;
+    std::array<double, C> opticalDepth_{};  // integrated so far
+    std::array<double, C> limits_;          // below this optical depth the product may matter
 };
 
 /// One estimate of the transmittance of the whole ray, per channel:
@@ -128,7 +146,7 @@ std::array<double, Field::kChannels> trackTransmittance(const Field& field,
             uint64_t bricks = 0;
             const auto exact = field.integrate(ray, tEnter, tExit, cost.lookups, bricks);
             for (size_t c = 0; c < C; ++c) {
-                sofar.opticalDepth[c] += settings.lengthPerVoxel * exact[c];
+                sofar.integrate(c, settings.lengthPerVoxel * exact[c]);
             }
             cost.exactLength += tExit - tEnter;
             return true;
@@ -140,8 +158,7 @@ std::array<double, Field::kChannels> trackTransmittance(const Field& field,
             for (size_t c = 0; c < C; ++c) {
                 // A channel without residual here keeps its weight to the bit.
                 if (C == 1 || Method::rate(v, c, settings.rateBase) > 0) {
-                    sofar.products[c].multiply(1 - (extinction[c] - Method::control(v, c, point)) /
-                                                       rate);
+                    sofar.multiply(c, 1 - (extinction[c] - Method::control(v, c, point)) / rate);
                 }
             }
             ++cost.lookups;
@@ -154,14 +171,14 @@ std::array<double, Field::kChannels> trackTransmittance(const Field& field,
         }
         distance -= remaining;
         for (size_t c = 0; c < C; ++c) {
-            sofar.opticalDepth[c] +=
-                settings.lengthPerVoxel * Method::integrate(v, c, ray, tEnter, tExit);
+            sofar.integrate(c,
+                            settings.lengthPerVoxel * Method::integrate(v, c, ray, tEnter, tExit));
         }
         return true;
     });
     std::array<double, C> result;
     for (size_t c = 0; c < C; ++c) {
-        result[c] = sofar.products[c].timesExp(sofar.opticalDepth[c]);
+        result[c] = sofar.value(c);
     }
     return result;
 }

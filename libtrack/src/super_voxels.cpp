@@ -8,8 +8,7 @@
 namespace trk {
 namespace {
 
-/// Of the bound. See rateAtLeast. Without it, at a mean optical depth of 1, the variance at equal
-/// look-ups would be up to a tenth lower, and the kurtosis up to 1e200.
+/// Of the bound. See rateAtLeast.
 constexpr float kLeastRate = 0.25f;
 
 /// How far a control may exceed the extinction. [Novak14, Eq. 6]: about D S collisions are

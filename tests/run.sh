@@ -35,6 +35,8 @@ run_preset() {
 }
 
 mkdir -p build
+# What one clone compiled serves the next.
+export CCACHE_BASEDIR=$PWD CCACHE_NOHASHDIR=1
 check_format
 for preset in ${1:-release dev}; do
     run_preset "$preset"

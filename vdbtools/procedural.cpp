@@ -5,7 +5,6 @@
 #include "io/vdb_writer.h"
 #include "math.h"
 
-#include <openvdb/openvdb.h>
 #include <tbb/blocked_range.h>
 #include <tbb/parallel_for.h>
 

@@ -2,7 +2,7 @@
 // The types of grid that can be a density, and their values as floats a channel.
 #pragma once
 
-#include <openvdb/openvdb.h>
+#include "openvdb_grids.h"
 
 #include <array>
 #include <cmath>

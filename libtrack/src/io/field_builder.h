@@ -9,7 +9,6 @@
 #include "density_types.h"
 #include "tree_regions.h"
 
-#include <openvdb/openvdb.h>
 #include <tbb/blocked_range.h>
 #include <tbb/parallel_for.h>
 #include <tbb/parallel_reduce.h>

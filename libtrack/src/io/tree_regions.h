@@ -3,8 +3,8 @@
 #pragma once
 
 #include "../math.h"
+#include "openvdb_grids.h"
 
-#include <openvdb/openvdb.h>
 #include <openvdb/tree/ValueAccessor.h>
 
 #include <algorithm>

@@ -4,8 +4,7 @@
 #pragma once
 
 #include "../math.h"
-
-#include <openvdb/openvdb.h>
+#include "openvdb_grids.h"
 
 #include <cstdint>
 #include <memory>

@@ -3,9 +3,8 @@
 // writer wants all grids in memory at once, and reports success on a full disk.
 #pragma once
 
+#include "openvdb_grids.h"
 #include "output_file.h"
-
-#include <openvdb/openvdb.h>
 
 #include <cstdint>
 #include <memory>

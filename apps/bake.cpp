@@ -81,19 +81,6 @@ void run(const Command& command, const std::vector<std::string>& given) {
     const double readTime = seconds();
     trk::OutputFile file(output, arguments.flag("force"));
     const trk::DensitySummary& summary = density.summary;
-    trk::SidecarHeader header;
-    header.toolVersion = TRACK_VERSION;
-    header.sourceFile = std::filesystem::path(input).filename().string();
-    header.source = summary.grid;
-    header.valueType = summary.valueType;
-    header.digest = summary.digest;
-    header.indexToWorld = summary.indexToWorld;
-    header.superVoxelSize = size;
-    header.levels = levels;
-    header.controlKind = bakeOptions.kind;
-    header.repair = summary.repair;
-    header.dropped = summary.dropped;
-    header.clamped = summary.clamped;
     trk::BakedVolume baked;
     {
         const Progress progress(arguments, "baking " + input);
@@ -102,7 +89,8 @@ void run(const Command& command, const std::vector<std::string>& given) {
     const double bakeTime = seconds() - readTime;
     {
         const Progress progress(arguments, "writing " + output);
-        trk::writeSidecar(file, header, baked, summary.anchor);
+        trk::writeSidecar(file, vdbtools::sidecarHeader(summary, bakeOptions), baked,
+                          summary.anchor);
         file.commit();
     }
     if (baked.items.empty() && !arguments.quiet()) {

@@ -187,14 +187,25 @@ Progress::~Progress() {
     }
 }
 
-void Progress::update(double fraction) {
-    const std::lock_guard<std::mutex> lock(progressMutex);
-    const int percent = static_cast<int>(100 * fraction);
-    if (shown_ && percent > percent_) {
-        percent_ = percent;
-        std::fprintf(stderr, "\r%s … %d %%", label_.c_str(), percent);
-        std::fflush(stderr);
+void Progress::update(double fraction) const {
+    if (!shown_) {
+        return;
     }
+    const std::lock_guard<std::mutex> lock(progressMutex);
+    const std::chrono::duration<double> elapsed = std::chrono::steady_clock::now() - start_;
+    const double seconds = elapsed.count();
+    if (seconds < last_ + 0.2) {
+        return;
+    }
+    last_ = seconds;
+    std::fprintf(stderr, "\r\033[K%s … %d %%", label_.c_str(), static_cast<int>(100 * fraction));
+    constexpr double kLong = 5;
+    const double left = fraction > 0 ? seconds / fraction - seconds : 0;
+    if (left > kLong) {
+        std::fprintf(stderr, ", %d:%02d left", static_cast<int>(left) / 60,
+                     static_cast<int>(left) % 60);
+    }
+    std::fflush(stderr);
 }
 
 std::string byteCount(uint64_t bytes) {

@@ -8,6 +8,7 @@
 #include <boost/program_options.hpp>
 
 #include <array>
+#include <chrono>
 #include <stdexcept>
 #include <string>
 #include <vector>
@@ -34,6 +35,7 @@ extern const Command kInfoCommand;
 extern const Command kVerifyCommand;
 extern const Command kQueryCommand;
 extern const Command kPreviewCommand;
+extern const Command kMeasureCommand;
 
 /// Thrown after --help was printed.
 struct HelpShown {};
@@ -91,7 +93,8 @@ int choiceIndex(const std::string& option, const std::string& name,
 /// Numbers separated by commas, or a UsageError: `count` of them.
 std::vector<double> numberList(const std::string& option, const std::string& text, size_t count);
 
-/// A line on stderr, overwritten as work goes on: only on a terminal, and not with --quiet.
+/// A line on stderr, overwritten as work goes on, with the time left where that is long: only on a
+/// terminal, and not with --quiet.
 class Progress {
   public:
     Progress(const Arguments& arguments, std::string label);
@@ -100,12 +103,13 @@ class Progress {
     Progress& operator=(const Progress&) = delete;
 
     /// Safe from any thread.
-    void update(double fraction);
+    void update(double fraction) const;
 
   private:
     std::string label_;
     bool shown_;
-    int percent_ = -1;
+    std::chrono::steady_clock::time_point start_ = std::chrono::steady_clock::now();
+    mutable double last_ = 0;  // shown, in seconds since the start
 };
 
 /// "1.5 MB".

@@ -80,5 +80,5 @@ Next: look at $out/$name.png, then try
   $vdbtrack --help
   apps/demo.sh YOUR_OWN.vdb
   $vdbtrack preview $sidecar -o $out/turn.png --frames 24
-  $vdbtrack bake YOUR_OWN.vdb --control affine     (less noise at the same size)
+  $vdbtrack measure $vdb -o $out/report      (what to bake for this volume, and why: two minutes)
 TEXT

@@ -10,11 +10,13 @@
 #include <ImfStringAttribute.h>
 #include <png.h>
 
+#include <algorithm>
 #include <cerrno>
 #include <cmath>
 #include <cstdint>
 #include <cstdio>
 #include <cstring>
+#include <iterator>
 #include <memory>
 
 namespace apps {
@@ -38,6 +40,29 @@ uint8_t encodeSrgb(float linear) {
     const float x = std::fmin(std::fmax(linear, 0.0f), 1.0f);
     const float s = x <= 0.0031308f ? 12.92f * x : 1.055f * std::pow(x, 1 / 2.4f) - 0.055f;
     return static_cast<uint8_t>(std::lround(255 * s));
+}
+
+std::vector<uint8_t> encodePixels(const Image& image, Tone tone) {
+    std::vector<uint8_t> bytes(image.pixelCount() * 3);
+    const char* const names[] = {"R", "G", "B"};
+    for (size_t c = 0; c < 3; ++c) {
+        const std::vector<float>& channel = image.channels.at(names[c]);
+        for (size_t i = 0; i < channel.size(); ++i) {
+            const float value = tone == Tone::kRolledOff ? toneMap(channel[i]) : channel[i];
+            bytes[3 * i + c] = encodeSrgb(value);
+        }
+    }
+    return bytes;
+}
+
+png_image pngOf(const Image& image) {
+    png_image png;
+    std::memset(&png, 0, sizeof(png));
+    png.version = PNG_IMAGE_VERSION;
+    png.width = static_cast<png_uint_32>(image.width);
+    png.height = static_cast<png_uint_32>(image.height);
+    png.format = PNG_FORMAT_RGB;
+    return png;
 }
 
 }  // namespace
@@ -68,25 +93,57 @@ void writeExr(const Image& image, const std::map<std::string, std::string>& attr
 }
 
 void writePng(const Image& image, Tone tone, const trk::OutputFile& file) {
-    std::vector<uint8_t> bytes(image.pixelCount() * 3);
-    const char* const names[] = {"R", "G", "B"};
-    for (size_t c = 0; c < 3; ++c) {
-        const std::vector<float>& channel = image.channels.at(names[c]);
-        for (size_t i = 0; i < channel.size(); ++i) {
-            const float value = tone == Tone::kRolledOff ? toneMap(channel[i]) : channel[i];
-            bytes[3 * i + c] = encodeSrgb(value);
-        }
-    }
-    png_image png;
-    std::memset(&png, 0, sizeof(png));
-    png.version = PNG_IMAGE_VERSION;
-    png.width = static_cast<png_uint_32>(image.width);
-    png.height = static_cast<png_uint_32>(image.height);
-    png.format = PNG_FORMAT_RGB;
+    const std::vector<uint8_t> bytes = encodePixels(image, tone);
+    png_image png = pngOf(image);
     errno = 0;
     if (!png_image_write_to_file(&png, file.path().c_str(), 0, bytes.data(), 0, nullptr)) {
         cannotWrite(file, errno ? std::strerror(errno) : png.message);
     }
+}
+
+std::string pngUri(const Image& image, Tone tone) {
+    const std::vector<uint8_t> pixels = encodePixels(image, tone);
+    png_image png = pngOf(image);
+    png_alloc_size_t size = PNG_IMAGE_PNG_SIZE_MAX(png);
+    std::vector<uint8_t> bytes(size);
+    if (!png_image_write_to_memory(&png, bytes.data(), &size, 0, pixels.data(), 0, nullptr)) {
+        throw trk::Error(TRK_ERROR_UNKNOWN,
+                         std::string("a picture cannot be made: ") + png.message);
+    }
+    bytes.resize(size);
+    static const char kDigits[] =
+        "ABCDEFGHIJKLMNOPQRSTUVWXYZabcdefghijklmnopqrstuvwxyz0123456789+/";
+    std::string text = "data:image/png;base64,";
+    for (size_t i = 0; i < size; i += 3) {
+        const size_t left = size - i;
+        const uint32_t three = static_cast<uint32_t>(bytes[i]) << 16 |
+                               (left > 1 ? static_cast<uint32_t>(bytes[i + 1]) << 8 : 0u) |
+                               (left > 2 ? static_cast<uint32_t>(bytes[i + 2]) : 0u);
+        for (size_t k = 0; k < 4; ++k) {
+            text += k <= left ? kDigits[three >> (18 - 6 * k) & 63] : '=';
+        }
+    }
+    return text;
+}
+
+std::array<float, 3> falseColor(float value) {
+    if (!std::isfinite(value)) {
+        return {{0.1f, 0.5f, 0.1f}};
+    }
+    // Linear light, about equally spaced in lightness.
+    static const float kAnchors[][3] = {{0.000f, 0.000f, 0.003f}, {0.017f, 0.003f, 0.083f},
+                                        {0.107f, 0.006f, 0.156f}, {0.333f, 0.020f, 0.105f},
+                                        {0.680f, 0.078f, 0.030f}, {0.930f, 0.270f, 0.006f},
+                                        {0.970f, 0.620f, 0.080f}, {0.975f, 1.000f, 0.370f}};
+    constexpr size_t kLast = std::size(kAnchors) - 1;
+    const float x = std::fmin(std::fmax(value, 0.0f), 1.0f) * static_cast<float>(kLast);
+    const size_t i = std::min(static_cast<size_t>(x), kLast - 1);
+    const float f = x - static_cast<float>(i);
+    std::array<float, 3> color{};
+    for (size_t c = 0; c < 3; ++c) {
+        color[c] = kAnchors[i][c] + f * (kAnchors[i + 1][c] - kAnchors[i][c]);
+    }
+    return color;
 }
 
 }  // namespace apps

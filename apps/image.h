@@ -4,6 +4,7 @@
 
 #include "io/output_file.h"
 
+#include <array>
 #include <cstddef>
 #include <map>
 #include <string>
@@ -33,5 +34,12 @@ enum class Tone { kLinear, kRolledOff };
 
 /// Writes channels R, G, B, sRGB encoded, 8 bit. Does not commit. Throws trk::Error.
 void writePng(const Image& image, Tone tone, const trk::OutputFile& file);
+
+/// The same as a "data:" URI, for pages that hold their pictures.
+std::string pngUri(const Image& image, Tone tone);
+
+/// A colour, linear, for a number from 0 (black, over violet and orange) to 1 (pale yellow); what
+/// is not finite is green. Lightness rises all the way.
+std::array<float, 3> falseColor(float value);
 
 }  // namespace apps

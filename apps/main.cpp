@@ -16,9 +16,9 @@
 
 namespace {
 
-const apps::Command* const kCommands[] = {&apps::kMakeCommand,  &apps::kBakeCommand,
-                                          &apps::kInfoCommand,  &apps::kVerifyCommand,
-                                          &apps::kQueryCommand, &apps::kPreviewCommand};
+const apps::Command* const kCommands[] = {
+    &apps::kMakeCommand,  &apps::kBakeCommand,    &apps::kInfoCommand,   &apps::kVerifyCommand,
+    &apps::kQueryCommand, &apps::kPreviewCommand, &apps::kMeasureCommand};
 
 void printUsage(std::ostream& out) {
     out << "vdbtrack " TRACK_VERSION ": transmittance through OpenVDB volumes\n\n";

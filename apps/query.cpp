@@ -5,6 +5,7 @@
 #include "error.h"
 #include "io/output_file.h"
 #include "io/sidecar.h"
+#include "names.h"
 #include "ray_file.h"
 #include "track/track.hpp"
 
@@ -23,8 +24,6 @@ namespace {
 
 namespace po = boost::program_options;
 
-const std::vector<std::string> kMethods{"exact", "residual", "ratio", "control", "delta", "march"};
-const std::vector<std::string> kChoices{"robust", "mean", "min", "max"};
 const std::vector<std::string> kRateBases{"majorant", "rms"};
 
 /// 9 significant digits; nothing for NaN.
@@ -114,7 +113,7 @@ std::string freePaths(const Arguments& arguments, const track::Volume& volume, T
 TrkQuery queryOf(const Arguments& arguments) {
     TrkQuery query = trkDefaultQuery();
     const std::string method = arguments.text("method");
-    query.method = choiceIndex("method", method, kMethods);
+    query.method = choiceIndex("method", method, vdbtools::kMethodNames);
     const bool freePaths = arguments.flag("free-paths");
     const auto needs = [&](const char* option, bool holds, const char* what) {
         if (arguments.given(option) && !holds) {
@@ -162,7 +161,7 @@ TrkVolumeOptions volumeOptionsOf(const Arguments& arguments) {
     options.scale = nonNegative(arguments, "scale");
     const std::array<float, 3> color = colorOf(arguments);
     std::copy(color.begin(), color.end(), options.color);
-    options.choice = choiceIndex("choice", arguments.text("choice"), kChoices);
+    options.choice = choiceIndex("choice", arguments.text("choice"), vdbtools::kChoiceNames);
     options.global = arguments.flag("global") ? 1 : 0;
     options.repair = repairBits(arguments);
     options.gridName = arguments.has("grid") ? arguments.get<std::string>("grid").c_str() : nullptr;

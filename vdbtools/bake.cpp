@@ -10,6 +10,7 @@
 
 #include <algorithm>
 #include <cmath>
+#include <filesystem>
 #include <limits>
 #include <map>
 #include <optional>
@@ -445,6 +446,23 @@ BakedVolume bake(const ExtinctionField& field, const BakeOptions& options) {
     BakedVolume baked = Baker(field, options).bake();
     addLevels(baked, field.box(), options.levels);
     return baked;
+}
+
+trk::SidecarHeader sidecarHeader(const trk::DensitySummary& source, const BakeOptions& options) {
+    trk::SidecarHeader header;
+    header.toolVersion = TRACK_VERSION;
+    header.sourceFile = std::filesystem::path(source.path).filename().string();
+    header.source = source.grid;
+    header.valueType = source.valueType;
+    header.digest = source.digest;
+    header.indexToWorld = source.indexToWorld;
+    header.superVoxelSize = options.superVoxelSize;
+    header.levels = options.levels;
+    header.controlKind = options.kind;
+    header.repair = source.repair;
+    header.dropped = source.dropped;
+    header.clamped = source.clamped;
+    return header;
 }
 
 ControlFit measureFit(const BakedVolume& baked) {

@@ -3,6 +3,7 @@
 #pragma once
 
 #include "extinction_field.h"
+#include "io/sidecar.h"
 #include "super_voxels.h"
 
 namespace vdbtools {
@@ -16,6 +17,9 @@ struct BakeOptions {
 /// Bakes a field, in parallel. The result has the same bits for any number of threads, and with or
 /// without tiles in the source.
 trk::BakedVolume bake(const trk::ExtinctionField& field, const BakeOptions& options);
+
+/// What a sidecar of such a bake says of itself.
+trk::SidecarHeader sidecarHeader(const trk::DensitySummary& source, const BakeOptions& options);
 
 /// How well a bake's control fits, over all occupied super-voxels and channels.
 struct ControlFit {

@@ -173,7 +173,7 @@ LitPreview::Light LitPreview::computeLight(const Vec3d& local) const {
             ray.tMin = 0;
             ray.tMax = std::numeric_limits<float>::infinity();
             std::array<double, V::kChannels> depth{};
-            const auto clipped = volume_.clip(ray, volume_.field.box());
+            const auto clipped = volume_.clip(ray, volume_.field->box());
             if (clipped && clipped->local.tEnd > kShadowStart) {
                 uint64_t ignored = 0;
                 depth = extinction.integrate(clipped->local, kShadowStart, clipped->local.tEnd,
@@ -194,7 +194,7 @@ LitPreview::Light LitPreview::computeLight(const Vec3d& local) const {
 /// Tabulates the light at the corners of a brick's cells, of those that hold anything, and more
 /// coarsely in constant regions.
 void LitPreview::tabulateLight() {
-    const ExtinctionField& field = volume_.field;
+    const ExtinctionField& field = *volume_.field;
     size_t places = 0;
     const auto add = [&](const Int3& origin, int shift, SparseTable::Entry entry) {
         const bool coarse =
@@ -285,7 +285,7 @@ void LitPreview::drawPixel(const TrkRay& ray, Picture& picture, size_t pixel) co
     double halfDepth = std::numeric_limits<double>::infinity();
     trk::withVariant(volume_, trk::ControlKind::kConstant, [&](auto variant) {
         using V = decltype(variant);
-        const auto clipped = volume_.clip(ray, volume_.field.box());
+        const auto clipped = volume_.clip(ray, volume_.field->box());
         if (!clipped) {
             return;
         }
@@ -302,7 +302,7 @@ void LitPreview::drawPixel(const TrkRay& ray, Picture& picture, size_t pixel) co
         const auto mean = [](const Color& c) { return (c[0] + c[1] + c[2]) / 3; };
         const auto densityAt = [&](const Vec3d& point) {
             double sum = 0;
-            for (const float d : volume_.field.density<V::kDensityChannels>(point)) {
+            for (const float d : volume_.field->density<V::kDensityChannels>(point)) {
                 sum += static_cast<double>(d);
             }
             return sum;
@@ -322,7 +322,7 @@ void LitPreview::drawPixel(const TrkRay& ray, Picture& picture, size_t pixel) co
                 halfDepth = start + lengthPerVoxel * (t0 + within * (t1 - t0));
             }
         };
-        volume_.field.forEachCell<V::kDensityChannels>(
+        volume_.field->forEachCell<V::kDensityChannels>(
             local, 0, local.tEnd, [&](double t0, double t1, const auto& integral) {
                 std::array<double, V::kChannels> depth;
                 double most = 0;

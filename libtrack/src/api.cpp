@@ -235,7 +235,8 @@ TrkStatus trkGetVolumeInfo(const TrkVolume* handle, TrkVolumeInfo* info) {
         const trk::Volume& volume = handle->volume;
         TrkVolumeInfo result{};
         result.size = sizeof(TrkVolumeInfo);
-        const trk::IntBox& box = volume.hasDensity ? volume.field.box() : volume.superVoxels.box();
+        const trk::IntBox& box =
+            volume.hasDensity() ? volume.field->box() : volume.superVoxels.box();
         trk::worldBounds(volume.indexToWorld, volume.anchor, box, result.boundsMin,
                          result.boundsMax);
         for (int row = 0; row < 3; ++row) {
@@ -247,10 +248,10 @@ TrkStatus trkGetVolumeInfo(const TrkVolume* handle, TrkVolumeInfo* info) {
         result.activeVoxels = volume.activeVoxels;
         result.bytes = volume.bytes();
         result.channels = static_cast<uint32_t>(volume.channels());
-        result.hasDensity = volume.hasDensity ? 1 : 0;
+        result.hasDensity = volume.hasDensity() ? 1 : 0;
         result.gridName = volume.grid.name.c_str();
         result.controlKind = "";
-        result.storage = !volume.hasDensity ? "" : volume.field.isHalf() ? "half" : "float";
+        result.storage = !volume.hasDensity() ? "" : volume.field->isHalf() ? "half" : "float";
         if (volume.hasSuperVoxels) {
             result.superVoxelSize = static_cast<uint32_t>(volume.superVoxels.size());
             result.superVoxelCount = volume.superVoxels.count();

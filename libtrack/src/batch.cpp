@@ -33,7 +33,7 @@ void checkRays(const TrkQuery& query, const TrkRay* rays, size_t rayCount) {
 }
 
 void requireDensity(const Volume& volume) {
-    if (!volume.hasDensity) {
+    if (!volume.hasDensity()) {
         throw Error(TRK_ERROR_NO_DENSITY,
                     volume.sidecarPath +
                         ": opened without its density, which this looks up; open the density's "

@@ -22,7 +22,7 @@ TrkFreePath sampleOne(const Volume& volume, const TrkQuery& query, const TrkRay&
     constexpr size_t C = V::kChannels;
     PathCost cost;
     FreePath<C> path;
-    const auto clipped = volume.clip(ray, volume.field.box());
+    const auto clipped = volume.clip(ray, volume.field->box());
     if (clipped) {
         const TrackingSettings settings = trackingSettings(query, clipped->lengthPerVoxel);
         const typename V::Extinction extinction(volume);
@@ -37,8 +37,10 @@ TrkFreePath sampleOne(const Volume& volume, const TrkQuery& query, const TrkRay&
     TrkFreePath result;
     result.t = std::numeric_limits<float>::infinity();
     if (path.collided) {
-        const auto t = static_cast<float>(clipped->tStart + path.t * clipped->tPerVoxel);
-        result.t = std::min(std::max(t, ray.tMin), ray.tMax);
+        // Finite, as infinity says that it escapes.
+        const double t = std::min(clipped->tStart + path.t * clipped->tPerVoxel,
+                                  static_cast<double>(std::numeric_limits<float>::max()));
+        result.t = std::min(std::max(static_cast<float>(t), ray.tMin), ray.tMax);
     }
     for (size_t c = 0; c < 3; ++c) {
         result.weight[c] = static_cast<float>(path.weight[C == 1 ? 0 : c]);
@@ -104,7 +106,7 @@ void sampleExtinction(const Volume& volume, const float* points, size_t pointStr
                 local[a] -= static_cast<double>(volume.anchor[static_cast<size_t>(a)]);
             }
             std::array<double, C> value{};
-            if (contains(volume.field.box(), local)) {
+            if (contains(volume.field->box(), local)) {
                 value = field.extinction(local);
             }
             std::transform(value.begin(), value.end(), extinction + i * C,

@@ -58,10 +58,10 @@ BakedVolume SuperVoxels::whole(const BakedVolume& baked, const IntBox& box) {
     for (size_t c = 0; c < baked.channels; ++c) {
         BakedSuperVoxel item;
         item.max = max[c];  // min stays 0: a continuous density that is 0 outside is 0 at the faces
-        item.mean = std::min(static_cast<float>(mass[c] / volume), max[c]);
+        item.mean = max[c] > 0 ? std::min(static_cast<float>(mass[c] / volume), max[c]) : 0.0f;
         const auto mean = static_cast<double>(item.mean);
         const double square = squares[c] / volume - mean * (2 * mass[c] / volume - mean);
-        item.deviation = roundUp(std::sqrt(std::max(square, 0.0)));
+        item.deviation = max[c] > 0 ? roundUp(std::sqrt(std::max(square, 0.0))) : 0.0f;
         item.majorant = std::max(item.max - item.mean, item.mean);
         item.rms = item.deviation;
         result.items.push_back(item);

@@ -41,7 +41,7 @@ std::array<double, V::kChannels> deterministicDepth(const Volume& volume, const 
                                                     PathCost& cost) {
     const bool exact = query.method == TRK_METHOD_EXACT;
     const auto clipped =
-        volume.clip(ray, exact ? volume.field.box() : volume.superVoxels.box(query.level));
+        volume.clip(ray, exact ? volume.field->box() : volume.superVoxels.box(query.level));
     if (!clipped) {
         return {};
     }
@@ -149,7 +149,7 @@ void estimateRay(const Volume& volume, const TrkQuery& query, const TrkRay& ray,
             estimate.mean[c] = std::exp(-depth[c]);
         }
     } else {
-        if (const auto clipped = volume.clip(ray, volume.field.box())) {
+        if (const auto clipped = volume.clip(ray, volume.field->box())) {
             clippedLength = clipped->local.tEnd;
             samples = query.samples;
             estimate = estimateRandomly<V>(volume, query, *clipped, rayId, cost);

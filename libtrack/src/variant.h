@@ -57,7 +57,7 @@ void withVariant(const Volume& volume, ControlKind kind, const Body& body) {
     constexpr std::integral_constant<size_t, 3> kThree;
     if (volume.channels() == 1) {
         withKind(kOne, kOne);
-    } else if (volume.hasDensity && volume.field.channels() == 1) {
+    } else if (volume.hasDensity() && volume.field->channels() == 1) {
         withKind(kOne, kThree);
     } else {
         withKind(kThree, kThree);

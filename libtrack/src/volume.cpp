@@ -116,29 +116,70 @@ std::string defaultSidecarPath(const std::string& vdbPath) {
     return path.string() + ".track.vdb";
 }
 
-Volume openVolume(const char* vdbPath, const char* sidecarPath, const VolumeOptions& options) {
+Volume makeVolume(const DensitySummary& summary, std::shared_ptr<const ExtinctionField> field,
+                  const VolumeOptions& options) {
     Volume volume;
+    volume.scales = channelScales(options, field->channels());
+    checkScale(volume.scales, summary.max, summary.path);
+    volume.grid = summary.grid;
+    volume.indexToWorld = summary.indexToWorld;
+    volume.worldToIndex = summary.indexToWorld.inverse();
+    volume.anchor = summary.anchor;
+    volume.activeVoxels = summary.activeVoxels;
+    volume.field = std::move(field);
+    return volume;
+}
+
+void addSuperVoxels(Volume& volume, BakedVolume baked, const VolumeOptions& options,
+                    const std::string& where) {
+    checkScale(volume.scales, baked.maxDensity(), where);
+    const bool constantOnly = options.choice == TRK_CHOICE_MIN || options.choice == TRK_CHOICE_MAX;
+    if (options.global && volume.hasDensity()) {
+        const IntBox& box = volume.field->box();
+        Vec3d edges;
+        for (int a = 0; a < 3; ++a) {
+            const auto axis = static_cast<size_t>(a);
+            edges[a] = static_cast<double>(box.hi[axis] - box.lo[axis]);
+        }
+        volume.globalSuperVoxel =
+            SuperVoxels(SuperVoxels::whole(baked, box), volume.scales, options.choice,
+                        volume.indexToWorld.longestDiagonal(edges));
+    } else if (constantOnly && baked.kind != ControlKind::kConstant) {
+        throw Error(TRK_ERROR_INVALID_ARGUMENT,
+                    where + ": choice min and max are constant controls, and this sidecar's is " +
+                        controlName(baked.kind) + "; expected robust or mean");
+    }
+    const double size = baked.superVoxelSize();
+    volume.superVoxels = SuperVoxels(std::move(baked), volume.scales, options.choice,
+                                     volume.indexToWorld.longestDiagonal({{size, size, size}}));
+    volume.hasSuperVoxels = true;
+}
+
+Volume openVolume(const char* vdbPath, const char* sidecarPath, const VolumeOptions& options) {
     const bool named = sidecarPath != nullptr && *sidecarPath != '\0';
     const bool wanted = sidecarPath == nullptr || named;
+    std::string path;
     if (named) {
-        volume.sidecarPath = sidecarPath;
+        path = sidecarPath;
     } else if (wanted && vdbPath != nullptr) {
-        volume.sidecarPath = defaultSidecarPath(vdbPath);
+        path = defaultSidecarPath(vdbPath);
     }
     if (vdbPath == nullptr && !named) {
         throw Error(TRK_ERROR_INVALID_ARGUMENT,
                     "neither a density nor a sidecar was named; expected at least one path");
     }
-    const bool haveSidecar = named || (wanted && std::filesystem::exists(volume.sidecarPath));
+    const bool haveSidecar = named || (wanted && std::filesystem::exists(path));
 
     Sidecar sidecar;
     if (haveSidecar) {
-        sidecar.header = readSidecarHeader(volume.sidecarPath);
+        sidecar.header = readSidecarHeader(path);
     }
+    Volume volume;
     if (vdbPath == nullptr) {
-        sidecar = readSidecar(volume.sidecarPath, nullptr, options.check);
+        sidecar = readSidecar(path, nullptr, options.check);
         volume.grid = sidecar.header.source;
         volume.indexToWorld = sidecar.header.indexToWorld;
+        volume.worldToIndex = volume.indexToWorld.inverse();
         volume.anchor = sidecar.anchor;
         volume.scales = channelScales(options, sidecar.baked.channels);
     } else {
@@ -148,44 +189,16 @@ Volume openVolume(const char* vdbPath, const char* sidecarPath, const VolumeOpti
         densityOptions.repair = options.repair | (haveSidecar ? sidecar.header.repair : 0u);
         densityOptions.maxMemory = options.maxMemory;
         Density density = loadDensity(vdbPath, densityOptions);
-        volume.scales = channelScales(options, density.field.channels());
-        checkScale(volume.scales, density.summary.max, vdbPath);
+        volume =
+            makeVolume(density.summary,
+                       std::make_shared<const ExtinctionField>(std::move(density.field)), options);
         if (haveSidecar) {
-            sidecar = readSidecar(volume.sidecarPath, &density.summary, options.check);
+            sidecar = readSidecar(path, &density.summary, options.check);
         }
-        volume.grid = density.summary.grid;
-        volume.indexToWorld = density.summary.indexToWorld;
-        volume.anchor = density.summary.anchor;
-        volume.activeVoxels = density.summary.activeVoxels;
-        volume.field = std::move(density.field);
-        volume.hasDensity = true;
     }
-    volume.worldToIndex = volume.indexToWorld.inverse();
+    volume.sidecarPath = path;
     if (haveSidecar) {
-        checkScale(volume.scales, sidecar.baked.maxDensity(), volume.sidecarPath);
-        const bool constantOnly =
-            options.choice == TRK_CHOICE_MIN || options.choice == TRK_CHOICE_MAX;
-        if (options.global && volume.hasDensity) {
-            const IntBox& box = volume.field.box();
-            Vec3d edges;
-            for (int a = 0; a < 3; ++a) {
-                const auto axis = static_cast<size_t>(a);
-                edges[a] = static_cast<double>(box.hi[axis] - box.lo[axis]);
-            }
-            volume.globalSuperVoxel =
-                SuperVoxels(SuperVoxels::whole(sidecar.baked, box), volume.scales, options.choice,
-                            volume.indexToWorld.longestDiagonal(edges));
-        } else if (constantOnly && sidecar.baked.kind != ControlKind::kConstant) {
-            throw Error(TRK_ERROR_INVALID_ARGUMENT,
-                        volume.sidecarPath +
-                            ": choice min and max are constant controls, and this "
-                            "sidecar's is " +
-                            controlName(sidecar.baked.kind) + "; expected robust or mean");
-        }
-        const double size = sidecar.baked.superVoxelSize();
-        volume.superVoxels = SuperVoxels(std::move(sidecar.baked), volume.scales, options.choice,
-                                         volume.indexToWorld.longestDiagonal({{size, size, size}}));
-        volume.hasSuperVoxels = true;
+        addSuperVoxels(volume, std::move(sidecar.baked), options, path);
     }
 #if defined(__GLIBC__)
     // OpenVDB's trees are millions of small blocks: freed, they would stay with the process, about

@@ -10,6 +10,7 @@
 #include <array>
 #include <cstddef>
 #include <cstdint>
+#include <memory>
 #include <optional>
 #include <string>
 #include <vector>
@@ -29,6 +30,8 @@ inline Int3 anchorFor(const IntBox& indexBox) {
     }
     return anchor;
 }
+
+struct DensitySummary;
 
 /// A grid's place in its file, as sidecars record it.
 struct GridIdentity {
@@ -52,8 +55,8 @@ struct Volume {
     /// densities of three channels, and for those of one with a tint.
     std::vector<double> scales{1.0};
 
-    bool hasDensity = false;
-    ExtinctionField field;  ///< density
+    /// The density, which several volumes may share; NULL where only a sidecar is open.
+    std::shared_ptr<const ExtinctionField> field;
 
     bool hasSuperVoxels = false;
     SuperVoxels superVoxels;                      ///< as baked
@@ -63,13 +66,16 @@ struct Volume {
     std::string sidecarPath;  ///< the sidecar, or where it was looked for
     uint64_t activeVoxels = 0;
 
+    bool hasDensity() const { return field != nullptr; }
     size_t channels() const { return scales.size(); }
     /// What the random methods walk over; control and levels are those of `superVoxels`.
     const SuperVoxels& tracked() const {
         return globalSuperVoxel ? *globalSuperVoxel : superVoxels;
     }
 
-    size_t bytes() const { return sizeof(*this) + field.bytes() + superVoxels.bytes(); }
+    size_t bytes() const {
+        return sizeof(*this) + (field ? field->bytes() : 0) + superVoxels.bytes();
+    }
 
     /// Clips a world-space ray against a box of local space. Nothing where nothing is left.
     std::optional<ClippedRay> clip(const TrkRay& ray, const IntBox& box) const;
@@ -81,7 +87,7 @@ class VolumeExtinction {
   public:
     static constexpr size_t kChannels = C;
 
-    explicit VolumeExtinction(const Volume& volume) : field_(volume.field) {
+    explicit VolumeExtinction(const Volume& volume) : field_(*volume.field) {
         std::copy_n(volume.scales.begin(), C, scales_.begin());
     }
 
@@ -143,6 +149,15 @@ struct VolumeOptions {
     uint32_t repair = 0;
     uint64_t maxMemory = 0;
 };
+
+/// A volume of a density in memory, without super-voxels. Throws Error where the options' scale is
+/// too large for it.
+Volume makeVolume(const DensitySummary& summary, std::shared_ptr<const ExtinctionField> field,
+                  const VolumeOptions& options);
+
+/// Gives a volume the super-voxels of a bake. `where` names the bake in errors. Throws Error.
+void addSuperVoxels(Volume& volume, BakedVolume baked, const VolumeOptions& options,
+                    const std::string& where);
 
 /// As trkOpenVolume: `vdbPath` may be NULL, `sidecarPath` NULL or empty. Throws Error.
 Volume openVolume(const char* vdbPath, const char* sidecarPath, const VolumeOptions& options);

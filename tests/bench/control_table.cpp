@@ -54,9 +54,9 @@ double median(std::vector<double> values) {
 }
 
 void printVolume(const std::string& label, const std::string& vdb) {
-    const trk::Density density = fixtures::load(vdb);
+    const Medium medium(label, vdb);
     std::printf("\n%s: %llu active voxels\n\n", label.c_str(),
-                static_cast<unsigned long long>(density.summary.activeVoxels));
+                static_cast<unsigned long long>(medium.source.summary.activeVoxels));
     std::printf(
         "| size | control | RMS | sidecar | depth 1: variance | look-ups | time | score | depth "
         "10: "
@@ -69,8 +69,7 @@ void printVolume(const std::string& label, const std::string& vdb) {
              {ControlKind::kConstant, ControlKind::kTrilinear, ControlKind::kAffine}) {
             const std::string sidecar = fixtures::path("table.track.vdb");
             fixtures::bake(vdb, sidecar, size, 4, kind);
-            const vdbtools::ControlFit fit = vdbtools::measureFit(
-                vdbtools::bake(density.field, fixtures::bakeOptions(size, 0, kind)));
+            const vdbtools::ControlFit fit = vdbtools::measureFit(medium.bake(size, kind));
             char head[96];
             std::snprintf(head, sizeof(head), "| %d | %s | %.2f | %.0f kB |", size,
                           trk::controlName(kind), fit.residualRms / fit.constantRms,
@@ -78,7 +77,7 @@ void printVolume(const std::string& label, const std::string& vdb) {
             heads.emplace_back(head);
             for (const double depth : {1.0, 10.0}) {
                 const Way way{"", TRK_METHOD_RESIDUAL, TRK_CHOICE_ROBUST, kind};
-                Row row{way, size, std::make_unique<Scene>(vdb, sidecar, way, depth, 300),
+                Row row{way, size, std::make_unique<Scene>(medium, size, way, depth, 300),
                         0,   0,    {}};
                 for (const PreparedRay& ray : row.scene->rays) {
                     const Moments m = momentsOf(*row.scene, ray);
@@ -113,12 +112,8 @@ void printVolume(const std::string& label, const std::string& vdb) {
 }  // namespace
 
 int main(int argc, char** argv) {
-    if (argc == 1) {
-        printVolume("procedural cloud", fixtures::cloudFile(256));
-        printVolume("procedural smoke", fixtures::cloudFile(256, "smoke"));
-    }
-    for (int i = 1; i < argc; ++i) {
-        printVolume(std::filesystem::path(argv[i]).filename().string(), argv[i]);
+    for (const fixtures::NamedVolume& volume : fixtures::volumesOf(argc, argv)) {
+        printVolume(volume.label, volume.vdb);
     }
     return 0;
 }

@@ -13,7 +13,6 @@
 #include <chrono>
 #include <cmath>
 #include <cstdio>
-#include <filesystem>
 #include <string>
 #include <vector>
 
@@ -75,19 +74,13 @@ std::vector<std::vector<Stretch>> stretchesOf(const Scene& scene) {
     return result;
 }
 
-std::string bakeFor(const std::string& vdb, int size, ControlKind kind) {
-    const std::string sidecar = fixtures::path("tracking.track.vdb");
-    fixtures::bake(vdb, sidecar, size, 0, kind);
-    return sidecar;
-}
-
-void printRates(const std::string& label, const std::string& vdb) {
+void printRates(const Medium& medium) {
     for (const int size : {4, 8, 16}) {
         for (const char* name : {"robust", "affine robust"}) {
             const Way way = wayNamed(name);
-            std::printf("| %s | %d | %s |", label.c_str(), size, trk::controlName(way.kind));
+            std::printf("| %s | %d | %s |", medium.label.c_str(), size, trk::controlName(way.kind));
             for (const double depth : {1.0, 10.0}) {
-                const Scene scene(vdb, bakeFor(vdb, size, way.kind), way, depth, 300);
+                const Scene scene(medium, size, way, depth, 300);
                 const auto rays = stretchesOf(scene);
                 const Sum majorant = sumAt(scene, rays, 0, 1);
                 double lo = 0.01;
@@ -113,11 +106,11 @@ struct Ending {
     double lookups = 0;
 };
 
-void printEnds(const std::string& label, const std::string& vdb) {
+void printEnds(const Medium& medium) {
     for (const char* name : {"ratio", "robust"}) {
         const Way way = wayNamed(name);
         for (const double depth : {1.0, 10.0, 100.0}) {
-            const Scene scene(vdb, bakeFor(vdb, 16, way.kind), way, depth, 300);
+            const Scene scene(medium, 16, way, depth, 300);
             std::vector<Ending> endings{{false, false, {}}, {false, true, {}}, {true, true, {}}};
             constexpr uint64_t kRounds = 9;
             constexpr uint64_t kSamples = 60;
@@ -146,7 +139,7 @@ void printEnds(const std::string& label, const std::string& vdb) {
                     e.lookups += static_cast<double>(cost.lookups) / (count * kRounds);
                 }
             }
-            std::printf("| %s | %s | %g |", label.c_str(), name, depth);
+            std::printf("| %s | %s | %g |", medium.label.c_str(), name, depth);
             const auto median = [](std::vector<double> values) {
                 std::sort(values.begin(), values.end());
                 return values[values.size() / 2];
@@ -164,26 +157,19 @@ void printEnds(const std::string& label, const std::string& vdb) {
 }  // namespace
 
 int main(int argc, char** argv) {
-    std::vector<std::pair<std::string, std::string>> volumes;
-    for (int i = 1; i < argc; ++i) {
-        volumes.emplace_back(std::filesystem::path(argv[i]).stem().string(), argv[i]);
-    }
-    if (volumes.empty()) {
-        volumes = {{"procedural cloud", fixtures::cloudFile(256)},
-                   {"procedural smoke", fixtures::cloudFile(256, "smoke")}};
-    }
+    const std::vector<fixtures::NamedVolume> volumes = fixtures::volumesOf(argc, argv);
     std::printf(
         "| volume | size | control | rate, depth 1 | variance | rate, depth 10 | variance "
         "|\n|---|---|---|---|---|---|---|\n");
     for (const auto& [label, vdb] : volumes) {
-        printRates(label, vdb);
+        printRates(Medium(label, vdb));
     }
     std::printf(
         "\n| volume | method | depth | neither: time | variance | look-ups | exact: time | "
         "variance | look-ups | and roulette: time | variance | look-ups |\n"
         "|---|---|---|---|---|---|---|---|---|---|---|---|\n");
     for (const auto& [label, vdb] : volumes) {
-        printEnds(label, vdb);
+        printEnds(Medium(label, vdb));
     }
     return 0;
 }

@@ -56,7 +56,7 @@ case_help() {
     contains stdout "vdbtrack bake IN.vdb"
     expect 0 --version
     contains stdout "vdbtrack 0."
-    for command in make bake info verify query preview; do
+    for command in make bake info verify query preview measure; do
         expect 0 "$command" --help
         contains stdout "usage: vdbtrack $command"
         [ ! -s stderr ] || fail "$command --help writes to stderr"
@@ -514,6 +514,60 @@ case_real_volumes() {
     for file in "$data"/*.vdb; do
         expect 0 info "$file"
     done
+}
+
+case_measure() {
+    small_cloud
+    local quick="--rounds 6 --ray-count 100 --size 8,all --depth 2,own"
+    # shellcheck disable=SC2086
+    expect 0 measure cloud.vdb -o report $quick --scatter 2 --scatter-samples 2 --scatter-width 24
+    [ ! -s stdout ] || fail "data on stdout"
+    contains stderr "normal accuracy: "
+    [ "$(ls report)" = "$(printf 'index.html\nmeasurements.csv\nmeasurements.json')" ] ||
+        fail "files: $(ls -a report)"
+    # A page of its own: plots and pictures inside, nothing to load, no script of gnuplot's.
+    for text in "<svg" "data:image/png;base64," "Recommendation" "Dual scattering" "residual, affine"; do
+        contains report/index.html "$text"
+    done
+    grep -qE 'src="?[^d"]|href="?http|gnuplot_svg' report/index.html && fail "the page loads something"
+    # 4 kinds of sets at 2 depths; every line has as many fields as the header; unbiased rows have
+    # errors, and no more than their bound.
+    awk -F, 'NR == 1 { n = NF; next }
+        { ++rows; sets[$1 $2 $3] = 1 }
+        NF != n { print "line " NR ": " NF " fields"; exit 1 }
+        $4 == "residual" && ($10 <= 0 || $15 == "" || $19 * $19 > 36) { print; exit 1 }
+        END { for (s in sets) ++k; if (k != 8 || rows % 8 != 0) { print k " sets, " rows " rows"; exit 1 } }' \
+        report/measurements.csv || fail "measurements.csv"
+    for key in z_bound mean_depth time_ns sidecar_bytes recommendation shadow_rmse; do
+        contains report/measurements.json "\"$key\""
+    done
+    expect 1 measure cloud.vdb -o report --quiet
+    one_line "report/measurements.csv: exists"
+    # shellcheck disable=SC2086
+    expect 0 measure cloud.vdb -o report $quick --force --quiet --method exact,ratio
+    [ ! -s stderr ] || fail "--quiet writes: $(cat stderr)"
+    # Where only exact integration survives, pictures are drawn at less depth. And a name need not be
+    # UTF-8.
+    cp cloud.vdb $'caf\xe9.vdb'
+    expect 0 measure $'caf\xe9.vdb' -o deep --depth 1e6 --rounds 4 --ray-count 50 --method exact,residual --size 8
+    contains deep/index.html "at a mean optical depth of 10."
+
+    expect 1 measure cloud.vdb -o nowhere/report
+    one_line "nowhere/report"
+    expect 1 measure missing.vdb -o other
+    one_line "missing.vdb"
+    PATH=/nonexistent expect 1 measure cloud.vdb -o other
+    one_line "gnuplot: not found"
+    absent other
+    expect 2 measure cloud.vdb
+    contains stderr "missing -o REPORT"
+    for wrong in "--size 5" "--size 8,,4" "--method magic" "--rate 0" "--depth deep" "--rounds 1" \
+        "--choice min --control affine --method residual --size 8" "--scatter 0" "--rate 1e-50"; do
+        # shellcheck disable=SC2086
+        expect 2 measure cloud.vdb -o other $wrong
+        contains stderr "usage: vdbtrack measure"
+    done
+    absent other
 }
 
 case_vdb_print() {

@@ -32,11 +32,11 @@ double estimateOnce(const Scene& scene, const PreparedRay& ray, trk::Rng& rng, s
 /// What the negative controls take apart: a grey volume with a constant control.
 using Grey = trk::Variant<1, 1, ControlKind::kConstant>;
 
+/// The procedural cloud, and the real volumes there are.
 struct Source {
     std::string label;
     std::string vdb;
 };
-
 std::vector<Source> sources() {
     std::vector<Source> all{{"procedural cloud", fixtures::cloudFile(96)}};
     if (!fixtures::dataFolder().empty()) {
@@ -45,12 +45,8 @@ std::vector<Source> sources() {
     }
     return all;
 }
-
-std::string sidecarOf(const Source& source, int size, ControlKind kind = ControlKind::kConstant) {
-    const std::string path =
-        fixtures::path(source.label + std::to_string(size) + trk::controlName(kind) + ".track.vdb");
-    fixtures::bake(source.vdb, path, size, 0, kind);
-    return path;
+Medium mediumOf(const Source& source) {
+    return {source.label, source.vdb};
 }
 
 /// Tests one channel of a scene and says what it found.
@@ -96,7 +92,7 @@ class EveryWay : public testing::TestWithParam<size_t> {
 };
 
 TEST_P(EveryWay, IsUnbiasedForEverySizeAndDepth) {
-    const Source source = sources()[GetParam()];
+    const Medium medium = mediumOf(sources()[GetParam()]);
     // Sanitizers look at the same code on fewer estimates.
     const std::vector<std::pair<int, double>> cases =
         fixtures::kSanitized
@@ -107,9 +103,9 @@ TEST_P(EveryWay, IsUnbiasedForEverySizeAndDepth) {
     std::printf("|z| must stay below %.2f\n", bound);
     for (const auto& [size, depth] : cases) {
         for (const Way& way : kWays) {
-            const Scene scene(source.vdb, sidecarOf(source, size, way.kind), way, depth, 300);
+            const Scene scene(medium, size, way, depth, 300);
             char label[64];
-            std::snprintf(label, sizeof(label), "%s, size %d, depth %g", source.label.c_str(), size,
+            std::snprintf(label, sizeof(label), "%s, size %d, depth %g", medium.label.c_str(), size,
                           depth);
             expectUnbiased(scene, label, 0, 150, bound);
         }
@@ -117,15 +113,15 @@ TEST_P(EveryWay, IsUnbiasedForEverySizeAndDepth) {
 }
 
 TEST_P(EveryWay, IsUnbiasedOverTheWholeVolumeAsOneSuperVoxel) {
-    const Source source = sources()[GetParam()];
+    const Medium medium = mediumOf(sources()[GetParam()]);
     const std::vector<double> depths =
         fixtures::kSanitized ? std::vector<double>{10} : std::vector<double>{1, 10, 100};
     const double bound = sidakBound(depths.size() * kGlobalWays.size());
     std::printf("|z| must stay below %.2f\n", bound);
     for (const double depth : depths) {
         for (const Way& way : kGlobalWays) {
-            const Scene scene(source.vdb, sidecarOf(source, 16), way, depth, 100);
-            expectUnbiased(scene, source.label + ", depth " + std::to_string(int(depth)), 0, 100,
+            const Scene scene(medium, 16, way, depth, 100);
+            expectUnbiased(scene, medium.label + ", depth " + std::to_string(int(depth)), 0, 100,
                            bound);
         }
     }
@@ -135,7 +131,7 @@ INSTANTIATE_TEST_SUITE_P(Estimators, EveryWay, testing::Values(0, 1, 2));
 
 TEST(Estimators, AreUnbiasedInColour) {
     struct Colour {
-        Source source;
+        Medium medium;
         std::array<float, 3> color;
     };
     const std::vector<Colour> colours{
@@ -149,11 +145,10 @@ TEST(Estimators, AreUnbiasedInColour) {
     // One channel of the last volume is 0, and no estimate.
     const double bound = sidakBound((3 * colours.size() - 1) * depths.size() * ways.size());
     std::printf("|z| must stay below %.2f\n", bound);
-    for (const auto& [source, color] : colours) {
+    for (const auto& [medium, color] : colours) {
         for (const Way& way : ways) {
-            const std::string sidecar = sidecarOf(source, 8, way.kind);
             for (const double depth : depths) {
-                const Scene scene(source.vdb, sidecar, way, depth, 100, color);
+                const Scene scene(medium, 8, way, depth, 100, color);
                 ASSERT_EQ(scene.volume.channels(), 3u);
                 for (size_t channel = 0; channel < 3; ++channel) {
                     if (color[channel] == 0) {
@@ -163,7 +158,7 @@ TEST(Estimators, AreUnbiasedInColour) {
                     }
                     char label[64];
                     std::snprintf(label, sizeof(label), "%s, depth %g, channel %zu",
-                                  source.label.c_str(), depth, channel);
+                                  medium.label.c_str(), depth, channel);
                     expectUnbiased(scene, label, channel, 100, bound);
                 }
             }
@@ -191,10 +186,9 @@ void expectRejected(const Scene& scene, const Wrong& wrong, const Factor& factor
 }
 
 TEST(Estimators, AControlDepthTwoPercentTooLargeIsRejected) {
-    const Source source = sources().front();
-    const std::string sidecar = sidecarOf(source, 8);
+    const Medium medium = mediumOf(sources().front());
     for (const char* way : {"robust", "mean"}) {  // `min` has next to no control to be wrong
-        const Scene scene(source.vdb, sidecar, wayNamed(way), 1, 300);
+        const Scene scene(medium, 8, wayNamed(way), 1, 300);
         const auto factor = [&](const PreparedRay& ray) {
             double depth = 0;
             Grey::Walk{scene.volume.superVoxels}.walk(
@@ -236,10 +230,9 @@ struct LyingSuperVoxels {
 };
 
 TEST(Estimators, ABoundOfZeroWhereThereIsResidualIsRejected) {
-    const Source source = sources().front();
-    const std::string sidecar = sidecarOf(source, 8);
+    const Medium medium = mediumOf(sources().front());
     // Over many rays, residuals of a mean control cancel.
-    const Scene scene(source.vdb, sidecar, wayNamed("min"), 1, 300);
+    const Scene scene(medium, 8, wayNamed("min"), 1, 300);
     const LyingSuperVoxels lying{scene.volume.superVoxels};
     const Grey::Extinction field(scene.volume);
     expectRejected(
@@ -271,13 +264,13 @@ TEST(Estimators, RobustResidualBeatsRatioInVarianceTimesLookups) {
         clouds.push_back({"wdas cloud", fixtures::dataFolder() + "/wdas_cloud_sixteenth.vdb"});
     }
     for (const Source& source : clouds) {
+        const Medium medium = mediumOf(source);
         for (const auto& [size, depth] :
              {std::pair{16, 1.0}, std::pair{16, 10.0}, std::pair{4, 1.0}, std::pair{4, 10.0}}) {
-            const std::string sidecar = sidecarOf(source, size);
             double score[2];
             for (const size_t v : {0u, 1u}) {
                 const Way way = wayNamed(v == 0 ? "ratio" : "robust");
-                const Scene scene(source.vdb, sidecar, way, depth, 300);
+                const Scene scene(medium, size, way, depth, 300);
                 double variance = 0;
                 double lookups = 0;
                 for (const PreparedRay& ray : scene.rays) {

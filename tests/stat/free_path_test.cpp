@@ -101,11 +101,9 @@ double probabilityOf(const Scene& truth, const PreparedRay& ray, const std::vect
                     std::erfc(std::fabs(z) / std::sqrt(2)));
 }
 
-std::string sidecarFor(const std::string& vdb, int size, ControlKind kind) {
-    const std::string path =
-        fixtures::path("free" + std::to_string(size) + trk::controlName(kind) + ".track.vdb");
-    fixtures::bake(vdb, path, size, 0, kind);
-    return path;
+/// What sampleFreePath sees of a way: its super-voxels.
+Way wayFor(ControlKind kind) {
+    return {"", TRK_METHOD_DELTA, TRK_CHOICE_ROBUST, kind};
 }
 
 /// Rays of a scene whose transmittance is neither 0 nor 1.
@@ -124,15 +122,15 @@ constexpr uint64_t kPaths = fixtures::kSanitized ? 1000 : 10000;
 constexpr size_t kRays = 6;
 
 TEST(FreePath, HasTheExactDistribution) {
-    std::vector<std::string> volumes{fixtures::cloudFile(96), fixtures::cloudFile(96, "smoke")};
+    const std::vector<Medium> volumes{{"cloud", fixtures::cloudFile(96)},
+                                      {"smoke", fixtures::cloudFile(96, "smoke")}};
     const std::vector<std::pair<int, double>> cases{{8, 1}, {8, 10}, {32, 10}, {32, 3000}};
     const auto comparisons =
         static_cast<double>(volumes.size() * cases.size() * kSamplers.size() * kRays * 2);
-    for (const std::string& vdb : volumes) {
+    for (const Medium& medium : volumes) {
         for (const auto& [size, depth] : cases) {
             for (const Sampler& sampler : kSamplers) {
-                const std::string sidecar = sidecarFor(vdb, size, sampler.kind);
-                const Scene scene(vdb, sidecar, {"", TRK_METHOD_DELTA}, depth, 60);
+                const Scene scene(medium, size, wayFor(sampler.kind), depth, 60);
                 double least = 1;
                 trk::PathCost cost;
                 double length = 0;
@@ -158,10 +156,9 @@ TEST(FreePath, HasTheExactDistribution) {
 }
 
 TEST(FreePath, OfAMediumTwoPercentDenserIsRejected) {
-    const std::string vdb = fixtures::cloudFile(96);
-    const std::string sidecar = sidecarFor(vdb, 8, ControlKind::kConstant);
-    const Scene truth(vdb, sidecar, {"", TRK_METHOD_DELTA}, 2, 60);
-    const Scene denser(vdb, sidecar, {"", TRK_METHOD_DELTA}, 2 * 1.02, 60);
+    const Medium medium("cloud", fixtures::cloudFile(96));
+    const Scene truth(medium, 8, wayFor(ControlKind::kConstant), 2, 60);
+    const Scene denser(medium, 8, wayFor(ControlKind::kConstant), 2 * 1.02, 60);
     for (const Sampler& sampler : kSamplers) {
         trk::PathCost cost;
         double least = 1;
@@ -232,12 +229,13 @@ double largestZ(const Scene& truth, const PreparedRay& ray, const std::vector<Pa
 
 TEST(FreePath, WeightsMakeItThatOfEveryChannel) {
     struct Colour {
-        std::string vdb;
+        Medium medium;
         std::array<float, 3> color;
     };
-    const std::vector<Colour> colours{{fixtures::cloudFile(96), {{1, 0.25f, 2}}},
-                                      {fixtures::cloudFile(96, "color-cloud"), {{1, 1, 1}}},
-                                      {fixtures::cloudFile(96, "color-cloud"), {{1, 0.25f, 0}}}};
+    const std::vector<Colour> colours{
+        {{"tinted", fixtures::cloudFile(96)}, {{1, 0.25f, 2}}},
+        {{"colour", fixtures::cloudFile(96, "color-cloud")}, {{1, 1, 1}}},
+        {{"tinted colour", fixtures::cloudFile(96, "color-cloud")}, {{1, 0.25f, 0}}}};
     size_t comparisons = 0;
     double largest = 0;
     double falseLargest = 0;
@@ -245,8 +243,7 @@ TEST(FreePath, WeightsMakeItThatOfEveryChannel) {
         for (const auto& [size, depth] :
              {std::pair{8, 1.0}, std::pair{8, 10.0}, std::pair{32, 3000.0}}) {
             for (const Sampler& sampler : kSamplers) {
-                const std::string sidecar = sidecarFor(colour.vdb, size, sampler.kind);
-                const Scene scene(colour.vdb, sidecar, {"", TRK_METHOD_DELTA}, depth, 60,
+                const Scene scene(colour.medium, size, wayFor(sampler.kind), depth, 60,
                                   colour.color);
                 trk::PathCost cost;
                 double here = 0;
@@ -287,9 +284,8 @@ TEST(FreePath, DecompositionSavesTheLookupsOfTheControl) {
         fixtures::makeGrid(openvdb::CoordBBox(0, 0, 0, 63, 63, 63), [](const openvdb::Coord& p) {
             return 1.0f + 0.5f * std::sin(0.3f * static_cast<float>(p.x() + 2 * p.y() - p.z()));
         });
-    const std::string vdb = fixtures::write("waves.vdb", {grid});
-    const std::string sidecar = sidecarFor(vdb, 8, ControlKind::kConstant);
-    const Scene scene(vdb, sidecar, {"", TRK_METHOD_DELTA}, 2, 60);
+    const Medium medium("waves", fixtures::write("waves.vdb", {grid}));
+    const Scene scene(medium, 8, wayFor(ControlKind::kConstant), 2, 60);
     const auto lookups = [&](bool decompose, bool wantsExtinction) {
         trk::PathCost cost;
         for (const PreparedRay& ray : scene.rays) {

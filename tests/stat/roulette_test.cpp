@@ -59,7 +59,7 @@ Sums sumsOf(const Scene& scene, double lo, double hi, uint64_t samples, const Es
 }
 
 TEST(Roulette, KeepsTheMeanSavesLookupsAndAddsLittleVariance) {
-    const std::string vdb = fixtures::cloudFile(96);
+    const Medium medium("cloud", fixtures::cloudFile(96));
     const std::vector<std::string> names{"ratio", "robust", "min", "affine robust", "robust, rms"};
     const std::vector<double> depths{6, 12};
     const double bound = sidakBound(2 * names.size() * depths.size());
@@ -67,11 +67,8 @@ TEST(Roulette, KeepsTheMeanSavesLookupsAndAddsLittleVariance) {
     const uint64_t samples = fixtures::kSanitized ? 100 : 1000;
     for (const std::string& name : names) {
         const Way way = wayNamed(name);
-        const std::string sidecar =
-            fixtures::path(std::string("roulette") + trk::controlName(way.kind) + ".track.vdb");
-        fixtures::bake(vdb, sidecar, 8, 0, way.kind);
         for (const double depth : depths) {
-            const Scene scene(vdb, sidecar, way, depth, 300);
+            const Scene scene(medium, 8, way, depth, 300);
             const auto estimateWith = [&](bool roulette, bool exactFallback) {
                 return [&, roulette, exactFallback](const PreparedRay& ray, trk::Rng& rng,
                                                     trk::PathCost& cost) {

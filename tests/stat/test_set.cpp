@@ -3,6 +3,7 @@
 
 #include "estimators/exact.h"
 #include "estimators/free_path.h"
+#include "support/fixtures.h"
 #include "support/rays.h"
 #include "support/reference.h"
 
@@ -16,10 +17,10 @@ std::vector<PreparedRay> prepare(const trk::Volume& volume, size_t count) {
     rays::Box box{};
     for (int a = 0; a < 3; ++a) {
         const auto axis = static_cast<size_t>(a);
-        box.lo[a] = 0.2 * static_cast<double>(volume.field.box().hi[axis]) +
-                    0.8 * static_cast<double>(volume.field.box().lo[axis]);
-        box.hi[a] = 0.8 * static_cast<double>(volume.field.box().hi[axis]) +
-                    0.2 * static_cast<double>(volume.field.box().lo[axis]);
+        box.lo[a] = 0.2 * static_cast<double>(volume.field->box().hi[axis]) +
+                    0.8 * static_cast<double>(volume.field->box().lo[axis]);
+        box.hi[a] = 0.8 * static_cast<double>(volume.field->box().hi[axis]) +
+                    0.2 * static_cast<double>(volume.field->box().lo[axis]);
     }
     std::vector<PreparedRay> result;
     std::mt19937_64 random(99);
@@ -41,7 +42,7 @@ std::vector<PreparedRay> prepare(const trk::Volume& volume, size_t count) {
             ray.direction[a] = static_cast<float>(v[a]);
         }
         ray.tMax = rays::kInfinity;
-        const auto clipped = volume.clip(ray, volume.field.box());
+        const auto clipped = volume.clip(ray, volume.field->box());
         if (!clipped) {
             continue;
         }
@@ -61,7 +62,8 @@ Moments momentsOf(const Scene& scene, const PreparedRay& ray, size_t channel) {
     const typename V::Walk superVoxels{scene.volume.tracked()};
     const LocalRay& r = ray.local;
     const double unit = settings.lengthPerVoxel;
-    double logMoment[5] = {0, 0, 0, 0, 0};
+    const openvdb::Vec4d kPowers(1, 2, 3, 4);
+    openvdb::Vec4d logMoments(0);  // of the powers 1 to 4
     Moments m;
     m.length = r.tEnd;
     superVoxels.walk(r, 0, r.tEnd, [&](const auto& v, double t0, double t1) {
@@ -74,25 +76,22 @@ Moments momentsOf(const Scene& scene, const PreparedRay& ray, size_t channel) {
         const auto extinction = [&](double t) { return field.extinction(r.at(t))[channel]; };
         m.lookups += rate * unit * (t1 - t0);
         if (!hasResidual) {
-            for (int p = 1; p <= 4; ++p) {
-                logMoment[p] -= p * unit * Method::integrate(v, channel, r, t0, t1);
-            }
+            logMoments -= unit * Method::integrate(v, channel, r, t0, t1) * kPowers;
             return true;
         }
-        for (int p = 1; p <= 4; ++p) {
-            logMoment[p] +=
-                unit * reference::integrateCells(r.origin, r.direction, t0, t1, [&](double t) {
-                    const double control = Method::control(v, channel, r.at(t));
-                    const double w = 1 - (extinction(t) - control) / rate;
-                    return rate * (std::pow(w, p) - 1) - p * control;
-                });
-        }
+        logMoments +=
+            unit * reference::integrateCells(r.origin, r.direction, t0, t1, [&](double t) {
+                const double control = Method::control(v, channel, r.at(t));
+                const double w = 1 - (extinction(t) - control) / rate;
+                const openvdb::Vec4d weights(w - 1, w * w - 1, w * w * w - 1, w * w * w * w - 1);
+                return rate * weights - control * kPowers;
+            });
         return true;
     });
-    const double T = std::exp(logMoment[1]);
-    const double m2 = std::exp(logMoment[2]);
-    const double m3 = std::exp(logMoment[3]);
-    const double m4 = std::exp(logMoment[4]);
+    const double T = std::exp(logMoments[0]);
+    const double m2 = std::exp(logMoments[1]);
+    const double m3 = std::exp(logMoments[2]);
+    const double m4 = std::exp(logMoments[3]);
     m.transmittance = T;
     m.variance = std::max(m2 - T * T, 0.0);
     m.third = m3 - 3 * T * m2 + 2 * T * T * T;
@@ -126,32 +125,35 @@ Way wayNamed(const std::string& name) {
     return {};
 }
 
-double sidakBound(size_t comparisons) {
-    const double alpha = 1 - std::pow(0.99, 1.0 / static_cast<double>(comparisons));
-    double lo = 0;
-    double hi = 20;
-    for (int i = 0; i < 100; ++i) {
-        const double middle = 0.5 * (lo + hi);
-        (std::erfc(middle / std::sqrt(2.0)) > alpha ? lo : hi) = middle;
-    }
-    return lo;
+Medium::Medium(std::string name, const std::string& vdb)
+    : label(std::move(name)), source(fixtures::loadSource(vdb)) {}
+
+const trk::BakedVolume& Medium::bake(int size, ControlKind kind) const {
+    const auto found = bakes_.find({size, kind});
+    return found != bakes_.end()
+               ? found->second
+               : bakes_
+                     .emplace(std::make_pair(size, kind),
+                              vdbtools::bake(*source.field, fixtures::bakeOptions(size, 0, kind)))
+                     .first->second;
 }
 
-Scene::Scene(const std::string& vdb, const std::string& sidecar, const Way& chosen,
-             double meanDepth, size_t count, const std::array<float, 3>& color)
+Scene::Scene(const Medium& medium, int size, const Way& chosen, double meanDepth, size_t count,
+             const std::array<float, 3>& color)
     : way(chosen), depth(meanDepth) {
     trk::VolumeOptions options;
     options.choice = way.choice;
     options.global = way.global;
     options.color = color;
-    const trk::Volume unscaled = trk::openVolume(vdb.c_str(), "", options);
-    rays = prepare(unscaled, count);
+    const vdbtools::Source& source = medium.source;
+    rays = prepare(trk::makeVolume(source.summary, source.field, options), count);
     double sum = 0;
     for (const PreparedRay& ray : rays) {
         sum += ray.exactDepth[0];
     }
     options.scale = static_cast<float>(meanDepth * static_cast<double>(rays.size()) / sum);
-    volume = trk::openVolume(vdb.c_str(), sidecar.c_str(), options);
+    volume = trk::makeVolume(source.summary, source.field, options);
+    trk::addSuperVoxels(volume, medium.bake(size, way.kind), options, medium.label);
     rays = prepare(volume, count);
 }
 

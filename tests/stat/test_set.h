@@ -4,6 +4,7 @@
 
 #include "estimators/ratio_tracking.h"
 #include "rng.h"
+#include "sweep.h"
 #include "variant.h"
 #include "volume.h"
 
@@ -12,7 +13,9 @@
 #include <array>
 #include <cmath>
 #include <cstdint>
+#include <map>
 #include <string>
+#include <utility>
 #include <vector>
 
 namespace estimates {
@@ -72,8 +75,7 @@ inline const std::vector<Way> kGlobalWays{{"global delta", TRK_METHOD_DELTA, TRK
 
 Way wayNamed(const std::string& name);
 
-/// z beyond which one of `comparisons` true hypotheses falls with probability 0.01 [Sidak 1967].
-double sidakBound(size_t comparisons);
+using vdbtools::sidakBound;
 
 struct PreparedRay {
     LocalRay local;
@@ -81,7 +83,21 @@ struct PreparedRay {
     std::array<double, 3> exactDepth;  ///< true optical depth, per channel
 };
 
-/// An opened volume at a scale where the rays that hit have a given mean optical depth in the first
+/// A density, loaded once, and its bakes, each made once.
+class Medium {
+  public:
+    Medium(std::string name, const std::string& vdb);
+
+    const trk::BakedVolume& bake(int size, ControlKind kind) const;
+
+    std::string label;
+    vdbtools::Source source;
+
+  private:
+    mutable std::map<std::pair<int, ControlKind>, trk::BakedVolume> bakes_;
+};
+
+/// A volume at a scale where the rays that hit have a given mean optical depth in the first
 /// channel.
 struct Scene {
     trk::Volume volume;
@@ -89,8 +105,9 @@ struct Scene {
     double depth;  ///< the mean one
     std::vector<PreparedRay> rays;
 
-    Scene(const std::string& vdb, const std::string& sidecar, const Way& chosen, double meanDepth,
-          size_t count, const std::array<float, 3>& color = {{1, 1, 1}});
+    /// `count` rays that hit; super-voxels of `size`, with the way's kind of control.
+    Scene(const Medium& medium, int size, const Way& chosen, double meanDepth, size_t count,
+          const std::array<float, 3>& color = {{1, 1, 1}});
 
     /// From the cells, not from the moments it is compared through.
     static std::array<double, 3> exactDepthOf(const trk::Volume& volume, const PreparedRay& ray);

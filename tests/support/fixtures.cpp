@@ -9,6 +9,8 @@
 #include <cmath>
 #include <cstdlib>
 #include <filesystem>
+#include <memory>
+#include <utility>
 
 namespace fixtures {
 namespace {
@@ -105,6 +107,26 @@ trk::Density load(const std::string& file, const std::string& grid) {
     return trk::loadDensity(file, options);
 }
 
+vdbtools::Source loadSource(const std::string& path) {
+    trk::Density density = load(path);
+    vdbtools::Source source;
+    source.summary = density.summary;
+    source.field = std::make_shared<const trk::ExtinctionField>(std::move(density.field));
+    return source;
+}
+
+std::vector<NamedVolume> volumesOf(int argc, char** argv) {
+    std::vector<NamedVolume> volumes;
+    for (int i = 1; i < argc; ++i) {
+        volumes.push_back({std::filesystem::path(argv[i]).stem().string(), argv[i]});
+    }
+    if (volumes.empty()) {
+        volumes = {{"procedural cloud", cloudFile(256)},
+                   {"procedural smoke", cloudFile(256, "smoke")}};
+    }
+    return volumes;
+}
+
 vdbtools::BakeOptions bakeOptions(int size, int levels, trk::ControlKind kind) {
     vdbtools::BakeOptions options;
     options.superVoxelSize = size;
@@ -116,19 +138,10 @@ vdbtools::BakeOptions bakeOptions(int size, int levels, trk::ControlKind kind) {
 void bake(const std::string& vdb, const std::string& sidecar, int size, int levels,
           trk::ControlKind kind) {
     const trk::Density density = load(vdb);
-    trk::SidecarHeader header;
-    header.toolVersion = "test";
-    header.sourceFile = "test.vdb";
-    header.source = density.summary.grid;
-    header.valueType = density.summary.valueType;
-    header.digest = density.summary.digest;
-    header.indexToWorld = density.summary.indexToWorld;
-    header.superVoxelSize = size;
-    header.controlKind = kind;
-    header.levels = levels;
+    const vdbtools::BakeOptions options = bakeOptions(size, levels, kind);
     trk::OutputFile file(sidecar, true);
-    trk::writeSidecar(file, header, vdbtools::bake(density.field, bakeOptions(size, levels, kind)),
-                      density.summary.anchor);
+    trk::writeSidecar(file, vdbtools::sidecarHeader(density.summary, options),
+                      vdbtools::bake(density.field, options), density.summary.anchor);
     file.commit();
 }
 

@@ -4,13 +4,14 @@
 
 #include "bake.h"
 #include "io/density.h"
+#include "io/openvdb_grids.h"
 #include "io/sidecar.h"
-
-#include <openvdb/openvdb.h>
+#include "sweep.h"
 
 #include <cstdint>
 #include <functional>
 #include <string>
+#include <vector>
 
 namespace fixtures {
 
@@ -52,6 +53,16 @@ std::string write(const std::string& name, const openvdb::GridCPtrVec& grids);
 std::string cloudFile(int n, const std::string& kind = "cloud");
 
 trk::Density load(const std::string& path, const std::string& grid = "");
+
+/// The same, to make many volumes over.
+vdbtools::Source loadSource(const std::string& path);
+
+/// What a benchmark runs on: the files of its command line, or the procedural cloud and smoke.
+struct NamedVolume {
+    std::string label;
+    std::string vdb;
+};
+std::vector<NamedVolume> volumesOf(int argc, char** argv);
 
 /// Bakes `vdb` to `sidecar` the way `vdbtrack bake` does.
 void bake(const std::string& vdb, const std::string& sidecar, int size, int levels = 2,

@@ -3,9 +3,8 @@
 // no walk of the library is involved.
 #pragma once
 
+#include "io/openvdb_grids.h"
 #include "track/track.h"
-
-#include <openvdb/openvdb.h>
 
 #include <algorithm>
 #include <cmath>
@@ -27,10 +26,10 @@ struct IndexRay {
 };
 
 /// Integral of g(t) over [t0, t1] of origin + t direction, by 4-point Gauss between consecutive
-/// integer planes: exact where g is a polynomial of degree 7 in each cell.
+/// integer planes: exact where g is a polynomial of degree 7 in each cell. g may answer a vector.
 template <class Vector, class G>
-double integrateCells(const Vector& origin, const Vector& direction, double t0, double t1,
-                      const G& g) {
+auto integrateCells(const Vector& origin, const Vector& direction, double t0, double t1,
+                    const G& g) {
     std::vector<double> cuts{t0, t1};
     for (int a = 0; a < 3; ++a) {
         const double x0 = origin[a] + t0 * direction[a];
@@ -47,12 +46,12 @@ double integrateCells(const Vector& origin, const Vector& direction, double t0, 
                              0.33998104358485626480, 0.86113631159405257522};
     const double weights[4] = {0.34785484513745385737, 0.65214515486254614263,
                                0.65214515486254614263, 0.34785484513745385737};
-    double sum = 0;
+    decltype(g(t0)) sum{};
     for (size_t i = 1; i < cuts.size(); ++i) {
         const double half = 0.5 * (cuts[i] - cuts[i - 1]);
         const double middle = 0.5 * (cuts[i] + cuts[i - 1]);
         for (int k = 0; k < 4; ++k) {
-            sum += half * weights[k] * g(middle + half * nodes[k]);
+            sum += (half * weights[k]) * g(middle + half * nodes[k]);
         }
     }
     return sum;

@@ -284,10 +284,10 @@ trk::Volume openWith(const std::string& vdb, ControlKind kind, int size, TrkChoi
 
 std::vector<trk::LocalRay> localRays(const trk::Volume& volume, size_t count) {
     rays::Box box{};
-    trk::worldBounds(volume.indexToWorld, volume.anchor, volume.field.box(), box.lo, box.hi);
+    trk::worldBounds(volume.indexToWorld, volume.anchor, volume.field->box(), box.lo, box.hi);
     std::vector<trk::LocalRay> result;
     for (const TrkRay& ray : rays::through(box, count, 30, 5)) {
-        if (const auto clipped = volume.clip(ray, volume.field.box())) {
+        if (const auto clipped = volume.clip(ray, volume.field->box())) {
             result.push_back(clipped->local);
         }
     }

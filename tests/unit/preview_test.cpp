@@ -24,7 +24,7 @@ vdbtools::Camera cameraOn(const trk::Volume& volume) {
     vdbtools::WorldBox box;
     double lo[3];
     double hi[3];
-    trk::worldBounds(volume.indexToWorld, volume.anchor, volume.field.box(), lo, hi);
+    trk::worldBounds(volume.indexToWorld, volume.anchor, volume.field->box(), lo, hi);
     for (int a = 0; a < 3; ++a) {
         box.lo[a] = lo[a];
         box.hi[a] = hi[a];

@@ -206,7 +206,8 @@ static inline TrkQuery trkDefaultQuery(void) {
 typedef struct TrkStatistics {
     uint64_t lookups;       /**< density values interpolated, over all samples */
     uint64_t superVoxels;   /**< occupied regions met, all samples: super-voxels, or for the exact
-                                 method bricks; equal neighbours may count as one */
+                                 method bricks; equal neighbours may count as one; delta
+                                 tracking in colour walks, and counts, once a channel */
     float standardError[3]; /**< of the mean, per channel; 0 for methods without noise, NaN for one
                                  sample of a random one */
     float exactShare;       /**< part of the clipped length that was integrated exactly, 0 to 1 */

@@ -210,7 +210,8 @@ FreePath<Field::kChannels> sampleFreePath(const Field& field, const SuperVoxels&
                 double realSum = 0;
                 double sum = 0;
                 for (size_t c = 0; c < C; ++c) {
-                    real[c] = ofControl ? control[c] : extinction[c] - control[c];
+                    // Rounding may leave less than nothing.
+                    real[c] = ofControl ? control[c] : std::fmax(extinction[c] - control[c], 0);
                     realSum += std::fabs(path.weight[c] * real[c]);
                     sum += std::fabs(path.weight[c] * real[c]) +
                            std::fabs(path.weight[c] * (part - real[c]));
@@ -255,11 +256,14 @@ std::array<double, Field::kChannels> trackBinary(const Field& field, const Super
         return {{path.collided ? 0.0 : 1.0}};
     } else {
         std::array<double, C> result;
+        const double exactBefore = cost.exactLength;
         for (size_t c = 0; c < C; ++c) {
             const detail::OneChannelField<Field> oneField{field, c};
             const detail::OneChannelWalk<SuperVoxels> oneWalk{superVoxels, c};
             result[c] = trackBinary(oneField, oneWalk, ray, settings, random, cost)[0];
         }
+        cost.exactLength =
+            exactBefore + (cost.exactLength - exactBefore) / static_cast<double>(C);  // of a walk
         return result;
     }
 }

@@ -7,6 +7,7 @@
 #include <sys/stat.h>
 #include <unistd.h>
 
+#include <atomic>
 #include <cerrno>
 #include <cstdio>
 #include <cstring>
@@ -16,15 +17,31 @@
 namespace trk {
 namespace {
 
-// What a signal handler removes: at most one temporary name at a time, in memory that never moves.
-char temporaryPath[4096];
-volatile bool haveTemporaryPath = false;
+// What a signal handler removes: temporary names, in memory that never moves.
+struct TemporaryName {
+    char path[4096];
+    std::atomic<bool> taken{false};
+    std::atomic<bool> complete{false};
+};
+TemporaryName temporaryNames[8];
 
 void rememberTemporary(const std::string& path) {
-    haveTemporaryPath = false;
-    if (path.size() < sizeof(temporaryPath)) {
-        std::memcpy(temporaryPath, path.c_str(), path.size() + 1);
-        haveTemporaryPath = true;
+    for (TemporaryName& name : temporaryNames) {
+        if (path.size() < sizeof(name.path) && !name.taken.exchange(true)) {
+            std::memcpy(name.path, path.c_str(), path.size() + 1);
+            name.complete = true;
+            return;
+        }
+    }
+}
+
+void forgetTemporary(const std::string& path) {
+    for (TemporaryName& name : temporaryNames) {
+        if (name.complete && path == name.path) {
+            name.complete = false;
+            name.taken = false;
+            return;
+        }
     }
 }
 
@@ -35,8 +52,10 @@ void rememberTemporary(const std::string& path) {
 }  // namespace
 
 void cleanUpOutputFiles() {
-    if (haveTemporaryPath) {
-        unlink(temporaryPath);
+    for (const TemporaryName& name : temporaryNames) {
+        if (name.complete) {
+            unlink(name.path);
+        }
     }
 }
 
@@ -85,7 +104,7 @@ OutputFile::OutputFile(std::string target, bool force) : target_(std::move(targe
 
 OutputFile::~OutputFile() {
     if (!temporaryName_.empty()) {
-        haveTemporaryPath = false;
+        forgetTemporary(temporaryName_);
         unlink(temporaryName_.c_str());
     }
     if (descriptor_ >= 0) {
@@ -133,7 +152,7 @@ void OutputFile::commit() {
     if (!force_) {
         if (renameat2(AT_FDCWD, temporaryName_.c_str(), AT_FDCWD, target_.c_str(),
                       RENAME_NOREPLACE) == 0) {
-            haveTemporaryPath = false;
+            forgetTemporary(temporaryName_);
             temporaryName_.clear();
             return;
         }
@@ -143,7 +162,7 @@ void OutputFile::commit() {
     if (rename(temporaryName_.c_str(), target_.c_str()) != 0) {
         fail(target_, force_ ? "cannot be replaced" : "cannot be written", errno);
     }
-    haveTemporaryPath = false;
+    forgetTemporary(temporaryName_);
     temporaryName_.clear();
 }
 

@@ -37,7 +37,8 @@ class OutputFile {
     int descriptor_ = -1;
 };
 
-/// Removes temporary files of this process. Async-signal-safe: for handlers that end the process.
+/// Removes temporary files of this process (of eight at a time). Async-signal-safe: for handlers
+/// that end the process.
 void cleanUpOutputFiles();
 
 }  // namespace trk

@@ -1,0 +1,40 @@
+// SPDX-License-Identifier: Apache-2.0
+// What `vdbtrack measure` writes: measurements.csv, measurements.json and a page to read. The keys
+// are described in libtrack/docs/measure.md.
+#pragma once
+
+#include "path_tracer.h"
+#include "recommendation.h"
+#include "strips.h"
+#include "sweep.h"
+
+#include <optional>
+#include <string>
+#include <vector>
+
+namespace apps {
+
+struct Report {
+    std::string input;    ///< base name
+    std::string command;  ///< that makes it again
+    vdbtools::Source source;
+    vdbtools::SweepOptions options;
+    vdbtools::Sweep sweep;
+    std::vector<vdbtools::Strip> strips;
+    float stripScale = 1;
+    double stripDepth = 0;
+    std::vector<vdbtools::Advice> advice;
+    std::optional<Scattering> scattering;
+    double seconds = 0;  ///< the whole run
+};
+
+/// One line a measured row.
+std::string csvOf(const Report& report);
+std::string jsonOf(const Report& report);
+/// A page without any other file: plots as SVG, pictures inside.
+std::string htmlOf(const Report& report);
+
+/// "--method …" paragraphs for a terminal.
+std::string adviceText(const Report& report);
+
+}  // namespace apps

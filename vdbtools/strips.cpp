@@ -1,0 +1,97 @@
+// SPDX-License-Identifier: Apache-2.0
+#include "strips.h"
+
+#include "camera.h"
+#include "transmittance.h"
+
+#include <array>
+#include <cmath>
+
+namespace vdbtools {
+namespace {
+
+/// Transmittance of the chosen control along a ray of a grey or tinted volume, mean over channels.
+template <size_t C>
+double controlTransmittance(const trk::Volume& volume, const TrkRay& ray) {
+    const auto clipped = volume.clip(ray, volume.field->box());
+    if (!clipped) {
+        return 1;
+    }
+    std::array<double, C> depth{};
+    const trk::LocalRay& local = clipped->local;
+    volume.tracked().walk<C, trk::ControlKind::kConstant>(
+        local, 0, local.tEnd, [&](const auto& v, double t0, double t1) {
+            for (size_t c = 0; c < C; ++c) {
+                depth[c] += v.integrateControl(c, local, t0, t1);
+            }
+            return true;
+        });
+    double sum = 0;
+    for (const double d : depth) {
+        sum += std::exp(-d * clipped->lengthPerVoxel) / static_cast<double>(C);
+    }
+    return sum;
+}
+
+}  // namespace
+
+Strip drawStrip(const Source& source, const trk::BakedVolume& baked, bool whole, float scale,
+                int width, uint32_t samples) {
+    Strip strip;
+    strip.whole = whole;
+    strip.size = baked.superVoxelSize();
+    strip.width = width;
+    const auto pixels = static_cast<size_t>(width) * static_cast<size_t>(width);
+    for (const TrkChoice choice :
+         {TRK_CHOICE_MIN, TRK_CHOICE_MEAN, TRK_CHOICE_MAX, TRK_CHOICE_ROBUST}) {
+        trk::VolumeOptions options;
+        options.scale = scale;
+        options.choice = choice;
+        options.global = whole;
+        trk::Volume volume = trk::makeVolume(source.summary, source.field, options);
+        trk::addSuperVoxels(volume, baked, options, "bake");
+        Camera camera = namedView("iso");
+        WorldBox box;
+        trk::worldBounds(volume.indexToWorld, volume.anchor, volume.field->box(), box.lo.x,
+                         box.hi.x);
+        frameBox(camera, box, 1);
+        std::vector<TrkRay> rays;
+        for (size_t i = 0; i < pixels; ++i) {
+            const auto n = static_cast<size_t>(width);
+            rays.push_back(camera.ray((static_cast<double>(i % n) + 0.5) / width,
+                                      (static_cast<double>(i / n) + 0.5) / width, 1));
+        }
+        TrkQuery query = trkDefaultQuery();
+        query.rayStride = sizeof(TrkRay);
+        query.samples = samples;
+        query.flags &= ~uint32_t{TRK_QUERY_ROULETTE};
+        const size_t channels = volume.channels();
+        std::vector<float> estimates(pixels * channels);
+        std::vector<TrkStatistics> statistics(pixels);
+        trk::estimateTransmittance(volume, query, rays.data(), pixels, estimates.data(),
+                                   statistics.data());
+        StripRow row;
+        row.choice = choice;
+        for (size_t i = 0; i < pixels; ++i) {
+            const double control = channels == 1 ? controlTransmittance<1>(volume, rays[i])
+                                                 : controlTransmittance<3>(volume, rays[i]);
+            double mean = 0;
+            double variance = 0;
+            for (size_t c = 0; c < channels; ++c) {
+                const auto error = static_cast<double>(statistics[i].standardError[c]);
+                mean += static_cast<double>(estimates[i * channels + c]);
+                variance += std::isnan(error) ? 0 : error * error * samples;
+            }
+            mean /= static_cast<double>(channels);
+            variance /= static_cast<double>(channels);
+            row.control.push_back(static_cast<float>(control));
+            row.residual.push_back(static_cast<float>(control > 0 ? mean / control : NAN));
+            row.product.push_back(static_cast<float>(mean));
+            row.variance.push_back(static_cast<float>(variance));
+        }
+        strip.rows.push_back(std::move(row));
+    }
+    return strip;
+}
+
+}  // namespace vdbtools

@@ -1,0 +1,736 @@
+// SPDX-License-Identifier: Apache-2.0
+#include "sweep.h"
+
+#include "batch.h"
+#include "camera.h"
+#include "error.h"
+#include "estimators/ratio_tracking.h"
+#include "io/sidecar.h"
+#include "names.h"
+#include "transmittance.h"
+#include "variant.h"
+
+#include <sched.h>
+#include <tbb/parallel_for.h>
+
+#include <algorithm>
+#include <chrono>
+#include <cmath>
+#include <cstdio>
+#include <filesystem>
+#include <limits>
+#include <map>
+#include <numeric>
+#include <random>
+#include <tuple>
+#include <utility>
+
+namespace vdbtools {
+namespace {
+
+using trk::ControlKind;
+using trk::Volume;
+
+constexpr double kNaN = std::numeric_limits<double>::quiet_NaN();
+
+/// Keeps this thread on the processor it runs on.
+class Pinned {
+  public:
+    Pinned() {
+        cpu_set_t one;
+        CPU_ZERO(&one);
+        const int processor = sched_getcpu();
+        restore_ = processor >= 0 && sched_getaffinity(0, sizeof(before_), &before_) == 0;
+        if (restore_) {
+            CPU_SET(static_cast<size_t>(processor), &one);
+            sched_setaffinity(0, sizeof(one), &one);
+        }
+    }
+    ~Pinned() {
+        if (restore_) {
+            sched_setaffinity(0, sizeof(before_), &before_);
+        }
+    }
+    Pinned(const Pinned&) = delete;
+    Pinned& operator=(const Pinned&) = delete;
+
+  private:
+    cpu_set_t before_{};
+    bool restore_ = false;
+};
+
+double secondsSince(std::chrono::steady_clock::time_point start) {
+    return std::chrono::duration<double>(std::chrono::steady_clock::now() - start).count();
+}
+
+TrkQuery oneThread(TrkMethod method) {
+    TrkQuery query = trkDefaultQuery();
+    query.method = method;
+    query.threads = 1;
+    query.rayStride = sizeof(TrkRay);
+    return query;
+}
+
+/// Exact optical depths, `channels` a ray.
+std::vector<double> exactDepths(const Volume& volume, const std::vector<TrkRay>& rays) {
+    std::vector<double> depths(rays.size() * volume.channels());
+    TrkQuery query = oneThread(TRK_METHOD_EXACT);
+    query.threads = 0;
+    trk::integrateOpticalDepth(volume, query, rays.data(), rays.size(), depths.data());
+    return depths;
+}
+
+double meanOf(const std::vector<double>& values) {
+    return values.empty() ? 0
+                          : std::accumulate(values.begin(), values.end(), 0.0) /
+                                static_cast<double>(values.size());
+}
+
+/// Rays through the cells of an n x n grid of pixels, one somewhere in each, row by row.
+std::vector<TrkRay> pixelRays(const Camera& camera, size_t n, uint64_t seed) {
+    std::mt19937_64 random(seed);
+    std::uniform_real_distribution<double> unit(0, 1);
+    std::vector<TrkRay> rays;
+    rays.reserve(n * n);
+    for (size_t i = 0; i < n * n; ++i) {
+        const double x = static_cast<double>(i % n) + unit(random);
+        const double y = static_cast<double>(i / n) + unit(random);
+        rays.push_back(camera.ray(x / static_cast<double>(n), y / static_cast<double>(n), 1));
+    }
+    return rays;
+}
+
+std::vector<TrkRay> thoseThatHit(const Volume& volume, const std::vector<TrkRay>& rays) {
+    const std::vector<double> depths = exactDepths(volume, rays);
+    const size_t channels = volume.channels();
+    std::vector<TrkRay> hits;
+    for (size_t i = 0; i < rays.size(); ++i) {
+        const auto* depth = &depths[i * channels];
+        if (std::any_of(depth, depth + channels, [](double d) { return d > 0; })) {
+            hits.push_back(rays[i]);
+        }
+    }
+    return hits;
+}
+
+/// Integral of g over [t0, t1] by four Gauss points: exact for polynomials of degree 7.
+template <class G>
+double integrateGauss(double t0, double t1, const G& g) {
+    constexpr double kNodes[2] = {0.33998104358485626480, 0.86113631159405257522};
+    constexpr double kWeights[2] = {0.65214515486254614263, 0.34785484513745385737};
+    const double half = 0.5 * (t1 - t0);
+    const double middle = 0.5 * (t1 + t0);
+    double sum = 0;
+    for (int i = 0; i < 2; ++i) {
+        sum += kWeights[i] * (g(middle - half * kNodes[i]) + g(middle + half * kNodes[i]));
+    }
+    return half * sum;
+}
+
+/// Per channel, the integral of residual^2 / rate over what is tracked.
+template <class V, class Method>
+std::array<double, V::kChannels> integrateNoise(const Volume& volume, const TrkQuery& query,
+                                                const trk::ClippedRay& clipped) {
+    constexpr size_t C = V::kChannels;
+    const trk::TrackingSettings settings = trk::trackingSettings(query, clipped.lengthPerVoxel);
+    const typename V::Extinction field(volume);
+    const typename V::Walk superVoxels{volume.tracked()};
+    const trk::LocalRay& ray = clipped.local;
+    std::array<double, C> sum{};
+    superVoxels.walk(ray, 0, ray.tEnd, [&](const auto& v, double t0, double t1) {
+        double rate = 0;
+        for (size_t c = 0; c < C; ++c) {
+            rate = std::max(rate, settings.rate * Method::rate(v, c, settings.rateBase));
+        }
+        const double expected = rate * settings.lengthPerVoxel * (t1 - t0);
+        if (rate == 0 || (settings.exactFallback && expected > trk::exactCost(ray, t1 - t0))) {
+            return true;
+        }
+        const auto add = [&](double a, double b, bool empty) {
+            for (size_t c = 0; c < C; ++c) {
+                if (C == 1 || Method::rate(v, c, settings.rateBase) > 0) {
+                    sum[c] += settings.lengthPerVoxel / rate * integrateGauss(a, b, [&](double t) {
+                                  const trk::Vec3d p = ray.at(t);
+                                  const double mu = empty ? 0 : field.extinction(p)[c];
+                                  const double residual = mu - Method::control(v, c, p);
+                                  return residual * residual;
+                              });
+                }
+            }
+        };
+        double done = t0;
+        field.forEachCell(ray, t0, t1, [&](double tEnter, double tExit, const auto&) {
+            if (tEnter > done) {
+                add(done, tEnter, true);  // nothing there, but perhaps a control
+            }
+            add(tEnter, tExit, false);
+            done = tExit;
+            return true;
+        });
+        if (t1 > done) {
+            add(done, t1, true);
+        }
+        return true;
+    });
+    return sum;
+}
+
+/// Volumes over one density and one extinction, by what distinguishes their super-voxels.
+class Volumes {
+  public:
+    using Bakes = std::map<std::pair<int, ControlKind>, trk::BakedVolume>;
+
+    Volumes(const Volume& plain, const Bakes& bakes, trk::VolumeOptions options)
+        : plain_(plain), bakes_(bakes), options_(std::move(options)) {}
+
+    const Volume& of(const Way& way) {
+        if (!way.usesSuperVoxels()) {
+            return plain_;
+        }
+        // Ratio and delta tracking do not look at the control, nor the control method at the
+        // choice.
+        const TrkChoice choice =
+            way.method == TRK_METHOD_RESIDUAL ? way.choice : TrkChoice{TRK_CHOICE_ROBUST};
+        const auto key = std::make_tuple(way.size, way.kind, choice);
+        const auto found = volumes_.find(key);
+        if (found != volumes_.end()) {
+            return found->second;
+        }
+        Volume volume = plain_;
+        trk::VolumeOptions options = options_;
+        options.choice = choice;
+        options.global = way.size == Way::kWholeVolume;
+        const auto bake = options.global ? bakes_.begin() : bakes_.find({way.size, way.kind});
+        trk::addSuperVoxels(volume, bake->second, options, "bake");
+        return volumes_.emplace(key, std::move(volume)).first->second;
+    }
+
+  private:
+    const Volume& plain_;
+    const Bakes& bakes_;
+    trk::VolumeOptions options_;
+    std::map<std::tuple<int, ControlKind, TrkChoice>, Volume> volumes_;
+};
+
+/// Sums over the estimates of one way on one set.
+struct Tally {
+    std::vector<double> times;  ///< ns a ray, one a round
+    std::array<double, 3> errors{};
+    std::array<double, 3> squares{};
+    double largestSquare = 0;
+    double sum = 0;
+    double largest = 0;
+    uint64_t lookups = 0;
+    uint64_t superVoxels = 0;
+    double exactShare = 0;
+};
+
+TrkQuery queryOf(const Way& way, uint64_t seed, uint64_t stream) {
+    TrkQuery query = oneThread(way.method);
+    query.seed = seed;
+    query.stream = stream;
+    if (way.method == TRK_METHOD_MARCH) {
+        query.step = static_cast<float>(way.rate);
+    } else {
+        query.rate = static_cast<float>(way.rate);
+    }
+    return query;
+}
+
+double median(std::vector<double> values) {
+    std::sort(values.begin(), values.end());
+    const size_t n = values.size();
+    return n == 0 ? 0 : 0.5 * (values[(n - 1) / 2] + values[n / 2]);
+}
+
+double spreadOf(std::vector<double> values) {
+    std::sort(values.begin(), values.end());
+    const size_t n = values.size();
+    return n < 4 ? kNaN : (values[(3 * n) / 4] - values[n / 4]) / median(values);
+}
+
+/// Measures all ways on the rays of one set.
+class SetRun {
+  public:
+    SetRun(const SweepSet& set, size_t setIndex, const std::vector<TrkRay>& rays,
+           const std::vector<double>& depths, size_t channels, const SweepOptions& options)
+        : set_(set),
+          index_(setIndex),
+          rays_(rays),
+          channels_(channels),
+          options_(options),
+          exact_(depths.size()),
+          estimates_(depths.size()),
+          tallies_(options.ways.size()) {
+        std::transform(depths.begin(), depths.end(), exact_.begin(),
+                       [](double d) { return std::exp(-d); });
+    }
+
+    void round(uint32_t round, Volumes& volumes) {
+        std::vector<size_t> order(options_.ways.size());
+        std::iota(order.begin(), order.end(), size_t{0});
+        std::shuffle(order.begin(), order.end(), std::mt19937_64(round));
+        for (const size_t w : order) {
+            const Way& way = options_.ways[w];
+            const Volume& volume = volumes.of(way);
+            TrkQuery query = queryOf(way, seedOf(w), round);
+            Tally& tally = tallies_[w];
+            if (round == 0) {
+                count(volume, query, tally);
+            }
+            const auto start = std::chrono::steady_clock::now();
+            trk::estimateTransmittance(volume, query, rays_.data(), rays_.size(), estimates_.data(),
+                                       nullptr);
+            tally.times.push_back(1e9 * secondsSince(start) / static_cast<double>(rays_.size()));
+            add(tally);
+        }
+    }
+
+    void finish(Volumes& volumes, std::vector<SweepRow>& rows) const {
+        for (size_t w = 0; w < options_.ways.size(); ++w) {
+            rows.push_back(rowOf(w, volumes));
+        }
+    }
+
+  private:
+    uint64_t seedOf(size_t way) const { return options_.seed + (index_ << 20) + way; }
+
+    /// What the estimates spend, from a few that are not timed.
+    void count(const Volume& volume, TrkQuery query, Tally& tally) {
+        std::vector<TrkStatistics> statistics(rays_.size());
+        query.samples = kCounted;
+        trk::estimateTransmittance(volume, query, rays_.data(), rays_.size(), estimates_.data(),
+                                   statistics.data());
+        for (const TrkStatistics& s : statistics) {
+            tally.lookups += s.lookups;
+            tally.superVoxels += s.superVoxels;
+            tally.exactShare += static_cast<double>(s.exactShare);
+        }
+    }
+
+    void add(Tally& tally) {
+        for (size_t i = 0; i < estimates_.size(); ++i) {
+            const auto estimate = static_cast<double>(estimates_[i]);
+            const double error = estimate - exact_[i];
+            tally.errors[i % channels_] += error;
+            tally.squares[i % channels_] += error * error;
+            tally.largestSquare = std::max(tally.largestSquare, error * error);
+            tally.sum += estimate;
+            tally.largest = std::max(tally.largest, std::fabs(estimate));
+        }
+    }
+
+    /// Per channel, the mean over rays of the variance that a formula gives; NaN where none does.
+    std::array<double, 3> predict(size_t w, Volumes& volumes) const {
+        const Way& way = options_.ways[w];
+        const auto n = static_cast<double>(rays_.size());
+        std::array<double, 3> sum{};
+        if (way.method == TRK_METHOD_DELTA) {
+            for (size_t i = 0; i < exact_.size(); ++i) {
+                sum[i % channels_] += exact_[i] * (1 - exact_[i]) / n;
+            }
+            return sum;
+        }
+        if (way.method != TRK_METHOD_RESIDUAL && way.method != TRK_METHOD_RATIO) {
+            sum.fill(way.isRandom() ? kNaN : 0.0);
+            return sum;
+        }
+        const Volume& volume = volumes.of(way);
+        const TrkQuery query = queryOf(way, 0, 0);
+        std::vector<std::array<double, 3>> variances(rays_.size());
+        tbb::parallel_for(size_t{0}, rays_.size(), [&](size_t i) {
+            variances[i] = predictVariance(volume, query, rays_[i]);
+        });
+        for (const auto& v : variances) {
+            for (size_t c = 0; c < channels_; ++c) {
+                sum[c] += v[c] / n;
+            }
+        }
+        return sum;
+    }
+
+    SweepRow rowOf(size_t w, Volumes& volumes) const {
+        const Way& way = options_.ways[w];
+        const Tally& tally = tallies_[w];
+        const auto rayCount = static_cast<double>(rays_.size());
+        const double estimates = rayCount * options_.rounds;
+        const std::array<double, 3> predicted = predict(w, volumes);
+        SweepRow row;
+        row.set = index_;
+        row.way = way;
+        row.nanoseconds = median(tally.times);
+        row.spread = spreadOf(tally.times);
+        // Methods without noise take one sample, whatever is asked for.
+        const double counted = rayCount * (way.isRandom() ? kCounted : 1);
+        row.lookups = static_cast<double>(tally.lookups) / counted;
+        row.superVoxels = static_cast<double>(tally.superVoxels) / counted;
+        row.exactShare = tally.exactShare / rayCount;
+        row.z = kNaN;
+        double squares = 0;
+        for (size_t c = 0; c < channels_; ++c) {
+            const auto channels = static_cast<double>(channels_);
+            const double bias = tally.errors[c] / estimates;
+            const double measured = tally.squares[c] / estimates;
+            squares += measured / channels;
+            row.bias += bias / channels;
+            row.predictedVariance += predicted[c] / channels;
+            if (way.isRandom()) {
+                const double variance =
+                    std::isnan(predicted[c]) ? measured : std::max(measured, predicted[c]);
+                // Results are floats, whose rounding repeats in every round.
+                constexpr double kRounding = 3e-8;
+                const double error =
+                    std::sqrt(variance / estimates + kRounding * kRounding / rayCount);
+                const double z = bias / error;
+                row.z = std::isnan(row.z) || std::fabs(z) > std::fabs(row.z) ? z : row.z;
+            }
+        }
+        if (way.isUnbiased()) {
+            row.variance = !way.isRandom() ? 0 : std::fmax(squares, row.predictedVariance);
+            row.rmse = std::sqrt(row.variance);
+        } else {
+            // A biased method's errors are no noise: each ray's has a mean of its own.
+            row.variance = way.isRandom() ? marchVariance(w, volumes) : 0;
+            row.rmse = std::sqrt(squares);
+        }
+        if (way.isRandom()) {
+            constexpr double kMost = 0.05;
+            const double sum = squares + kLeastVariance;  // a ray, over channels
+            row.converged =
+                (tally.sum > 0 || set_.meanTransmittance == 0) &&
+                tally.largest <= kMost * tally.sum &&
+                tally.largestSquare <= kMost * sum * estimates * static_cast<double>(channels_) &&
+                !(row.predictedVariance + kLeastVariance > 2 * sum);
+        }
+        return row;
+    }
+
+    /// The mean over rays of the variance around each ray's own mean, which is not the exact value.
+    double marchVariance(size_t w, Volumes& volumes) const {
+        constexpr uint32_t kSamples = 16;
+        TrkQuery query = queryOf(options_.ways[w], seedOf(w), options_.rounds);
+        query.samples = kSamples;
+        std::vector<float> means(exact_.size());
+        std::vector<TrkStatistics> statistics(rays_.size());
+        trk::estimateTransmittance(volumes.of(options_.ways[w]), query, rays_.data(), rays_.size(),
+                                   means.data(), statistics.data());
+        double sum = 0;
+        for (const TrkStatistics& s : statistics) {
+            for (size_t c = 0; c < channels_; ++c) {
+                const auto error = static_cast<double>(s.standardError[c]);
+                sum += error * error * kSamples;
+            }
+        }
+        return sum / static_cast<double>(exact_.size());
+    }
+
+    static constexpr uint32_t kCounted = 4;
+
+    const SweepSet& set_;
+    size_t index_;
+    const std::vector<TrkRay>& rays_;
+    size_t channels_;
+    const SweepOptions& options_;
+    std::vector<double> exact_;  // transmittance
+    std::vector<float> estimates_;
+    std::vector<Tally> tallies_;
+};
+
+SweepBake bakeInto(Volumes::Bakes& bakes, const Source& source, int size, ControlKind kind) {
+    BakeOptions options;
+    options.superVoxelSize = size;
+    options.kind = kind;
+    const auto start = std::chrono::steady_clock::now();
+    trk::BakedVolume& baked = bakes[{size, kind}] = bake(*source.field, options);
+    SweepBake result;
+    result.seconds = secondsSince(start);
+    result.size = size;
+    result.kind = kind;
+    result.superVoxels = static_cast<uint64_t>(baked.table.occupiedItems());
+    const ControlFit fit = measureFit(baked);
+    result.residualShare = fit.fieldRms > 0 ? fit.residualRms / fit.fieldRms : 0;
+    // Never committed: it leaves nothing behind.
+    const trk::OutputFile file(
+        (std::filesystem::temp_directory_path() / "measured.track.vdb").string(), true);
+    trk::writeSidecar(file, sidecarHeader(source.summary, options), baked, source.summary.anchor);
+    result.sidecarBytes = std::filesystem::file_size(file.path());
+    baked.levels.clear();  // no way looks at them
+    return result;
+}
+
+}  // namespace
+
+bool operator==(const Way& a, const Way& b) {
+    return std::tie(a.method, a.kind, a.choice, a.size, a.rate) ==
+           std::tie(b.method, b.kind, b.choice, b.size, b.rate);
+}
+
+std::string nameOf(const Way& way) {
+    std::string name = kMethodNames[static_cast<size_t>(way.method)];
+    if (way.usesControl()) {
+        name += std::string(", ") + trk::controlName(way.kind);
+    }
+    if (way.method == TRK_METHOD_RESIDUAL) {
+        name += " " + kChoiceNames[static_cast<size_t>(way.choice)];
+    }
+    if (way.usesSuperVoxels()) {
+        name +=
+            way.size == Way::kWholeVolume ? ", whole volume" : ", size " + std::to_string(way.size);
+    }
+    char number[40] = "";
+    if (way.method == TRK_METHOD_MARCH) {
+        std::snprintf(number, sizeof(number), ", step %g", way.rate);
+    } else if (way.isRandom()) {
+        std::snprintf(number, sizeof(number), ", rate %g", way.rate);
+    }
+    return name + number;
+}
+
+std::vector<Way> sweepWays(const std::vector<TrkMethod>& methods,
+                           const std::vector<ControlKind>& kinds,
+                           const std::vector<TrkChoice>& choices, const std::vector<int>& sizes,
+                           const std::vector<double>& rates) {
+    std::vector<Way> ways;
+    const auto add = [&](const Way& way) {
+        if (std::find(ways.begin(), ways.end(), way) == ways.end()) {
+            ways.push_back(way);
+        }
+    };
+    for (const TrkMethod method : methods) {
+        Way way;
+        way.method = method;
+        if (!way.usesSuperVoxels()) {
+            for (const double step : {1.0, 4.0}) {
+                way.rate = method == TRK_METHOD_MARCH ? step : 1;
+                add(way);
+            }
+            continue;
+        }
+        for (const int size : sizes) {
+            way.size = size;
+            const bool whole = size == Way::kWholeVolume;
+            for (const ControlKind kind : kinds) {
+                // What is made of the whole volume is constant; ratio and delta have no control.
+                const bool constant = whole || !way.usesControl();
+                way.kind = constant ? ControlKind::kConstant : kind;
+                if (method == TRK_METHOD_CONTROL) {
+                    if (!whole) {
+                        add(way);
+                    }
+                    continue;
+                }
+                for (const TrkChoice choice : choices) {
+                    const bool constantOnly = choice == TRK_CHOICE_MIN || choice == TRK_CHOICE_MAX;
+                    if (constantOnly && way.kind != ControlKind::kConstant) {
+                        continue;
+                    }
+                    way.choice = way.usesControl() ? choice : TrkChoice{TRK_CHOICE_ROBUST};
+                    for (const double rate : rates) {
+                        // A looser majorant only costs delta tracking time.
+                        way.rate = method == TRK_METHOD_DELTA ? 1 : rate;
+                        add(way);
+                    }
+                }
+            }
+        }
+    }
+    return ways;
+}
+
+double sidakBound(size_t comparisons) {
+    const double alpha =
+        -std::expm1(std::log(0.99) / static_cast<double>(std::max(comparisons, size_t{1})));
+    double lo = 0;
+    double hi = 20;
+    for (int i = 0; i < 100; ++i) {
+        const double middle = 0.5 * (lo + hi);
+        (std::erfc(middle / std::sqrt(2.0)) > alpha ? lo : hi) = middle;
+    }
+    return lo;
+}
+
+std::array<double, 3> predictVariance(const Volume& volume, const TrkQuery& query,
+                                      const TrkRay& ray) {
+    std::array<double, 3> result{};
+    const auto clipped = volume.clip(ray, volume.field->box());
+    if (!clipped) {
+        return result;
+    }
+    std::array<double, 3> depth{};
+    TrkQuery exact = oneThread(TRK_METHOD_EXACT);
+    trk::integrateOpticalDepth(volume, exact, &ray, 1, depth.data());
+    const bool residual = query.method == TRK_METHOD_RESIDUAL;
+    trk::withVariant(
+        volume, residual ? volume.tracked().kind() : ControlKind::kConstant, [&](auto variant) {
+            using V = decltype(variant);
+            const auto noise =
+                residual ? integrateNoise<V, trk::ResidualControl>(volume, query, *clipped)
+                         : integrateNoise<V, trk::NoControl>(volume, query, *clipped);
+            for (size_t c = 0; c < V::kChannels; ++c) {
+                // Together, as the second factor alone may be too large.
+                result[c] = noise[c] > 1
+                                ? std::exp(noise[c] - 2 * depth[c]) - std::exp(-2 * depth[c])
+                                : std::exp(-2 * depth[c]) * std::expm1(noise[c]);
+            }
+        });
+    return result;
+}
+
+std::vector<TrkRay> cameraRays(const Volume& volume, size_t count, uint64_t seed) {
+    Camera camera = namedView("iso");
+    WorldBox box;
+    trk::worldBounds(volume.indexToWorld, volume.anchor, volume.field->box(), box.lo.x, box.hi.x);
+    frameBox(camera, box, 1);
+    // How many pixels it takes depends on how much of the picture is hit. Where that is next to
+    // nothing, fewer rays must do.
+    auto n = static_cast<size_t>(std::ceil(std::sqrt(2 * static_cast<double>(count))));
+    const size_t most = std::max(n, size_t{2048});
+    std::vector<TrkRay> rays = thoseThatHit(volume, pixelRays(camera, n, seed));
+    while (n < most && rays.size() < count / 4) {
+        n = std::min(2 * n, most);
+        rays = thoseThatHit(volume, pixelRays(camera, n, seed));
+    }
+    if (rays.empty()) {
+        return rays;
+    }
+    const double share = static_cast<double>(rays.size()) / static_cast<double>(n * n);
+    n = std::min(most,
+                 static_cast<size_t>(std::ceil(std::sqrt(static_cast<double>(count) / share))));
+    return thoseThatHit(volume, pixelRays(camera, n, seed));
+}
+
+std::vector<TrkRay> secondaryRays(const Volume& volume, const std::vector<TrkRay>& rays,
+                                  uint64_t seed) {
+    std::mt19937_64 random(seed);
+    std::uniform_real_distribution<double> unit(0, 1);
+    std::normal_distribution<double> normal;
+    const std::vector<double> depths = exactDepths(volume, rays);
+    const size_t channels = volume.channels();
+    std::vector<TrkRay> result;
+    for (size_t i = 0; i < rays.size(); ++i) {
+        const auto clipped = volume.clip(rays[i], volume.field->box());
+        if (!clipped) {
+            continue;
+        }
+        // A collision of the densest channel, given that there is one: the optical depth it lies
+        // at, then where that is.
+        const double* own = depths.data() + i * channels;
+        const double* densest = std::max_element(own, own + channels);
+        const double target = -std::log1p(unit(random) * std::expm1(-*densest));
+        TrkRay ray = rays[i];
+        double lo = clipped->tStart;
+        double hi = clipped->tStart + clipped->tPerVoxel * clipped->local.tEnd;
+        const TrkQuery query = oneThread(TRK_METHOD_EXACT);
+        for (int k = 0; k < 40; ++k) {
+            const double middle = 0.5 * (lo + hi);
+            ray.tMax = static_cast<float>(middle);
+            double found[3];
+            trk::integrateOpticalDepth(volume, query, &ray, 1, found);
+            (found[densest - own] < target ? lo : hi) = middle;
+        }
+        TrkRay secondary{};
+        trk::Vec3d direction;
+        do {
+            direction = {{normal(random), normal(random), normal(random)}};
+        } while (length(direction) < 1e-3);
+        for (int a = 0; a < 3; ++a) {
+            secondary.origin[a] = ray.origin[a] + static_cast<float>(lo) * ray.direction[a];
+            secondary.direction[a] = static_cast<float>(direction[a] / length(direction));
+        }
+        secondary.tMax = std::numeric_limits<float>::infinity();
+        result.push_back(secondary);
+    }
+    result = thoseThatHit(volume, result);
+    std::shuffle(result.begin(), result.end(), random);
+    return result;
+}
+
+double meanOpticalDepth(const Volume& volume, const std::vector<TrkRay>& rays) {
+    return meanOf(exactDepths(volume, rays));
+}
+
+Sweep runSweep(const Source& source, const SweepOptions& options,
+               const std::function<void(double)>& progress) {
+    Sweep sweep;
+    trk::VolumeOptions volumeOptions;
+    const Volume unscaled = trk::makeVolume(source.summary, source.field, volumeOptions);
+    const std::vector<TrkRay> camera = cameraRays(unscaled, options.rayCount, options.seed);
+    if (camera.empty()) {
+        throw trk::Error(TRK_ERROR_BAD_DENSITY, source.summary.path + ": grid " +
+                                                    source.summary.grid.name +
+                                                    ": expected some density, found none on " +
+                                                    "any ray; there is nothing to measure");
+    }
+    sweep.unscaledDepth = meanOpticalDepth(unscaled, camera);
+
+    Volumes::Bakes bakes;
+    for (const Way& way : options.ways) {
+        if (way.size > 0 && bakes.find({way.size, way.kind}) == bakes.end()) {
+            sweep.bakes.push_back(bakeInto(bakes, source, way.size, way.kind));
+        }
+    }
+    if (bakes.empty()) {  // what covers the whole volume is made of a bake, of any size
+        bakeInto(bakes, source, 16, ControlKind::kConstant);
+    }
+
+    std::vector<bool> colours;
+    if (options.grey) {
+        colours.push_back(false);
+    }
+    if (options.coloured) {
+        colours.push_back(true);
+    }
+    const auto steps = static_cast<double>(options.depths.size() * colours.size() *
+                                           options.rays.size() * options.rounds);
+    double done = 0;
+    size_t comparisons = 0;
+    for (const bool coloured : colours) {
+        for (const double depth : options.depths) {
+            volumeOptions.scale =
+                depth > 0 ? static_cast<float>(depth / sweep.unscaledDepth) : options.scale;
+            volumeOptions.color = coloured ? options.color : std::array<float, 3>{{1, 1, 1}};
+            const Volume plain = trk::makeVolume(source.summary, source.field, volumeOptions);
+            Volumes volumes(plain, bakes, volumeOptions);
+            for (const RayKind kind : options.rays) {
+                SweepSet set;
+                set.rays = kind;
+                set.coloured = coloured;
+                set.depth = depth;
+                set.scale = volumeOptions.scale;
+                const std::vector<TrkRay> rays =
+                    kind == RayKind::kCamera ? camera
+                                             : secondaryRays(plain, camera, options.seed + 1);
+                if (rays.empty()) {
+                    throw trk::Error(TRK_ERROR_BAD_DENSITY,
+                                     source.summary.path +
+                                         ": no secondary ray meets any density at scale " +
+                                         std::to_string(set.scale));
+                }
+                const std::vector<double> depths = exactDepths(plain, rays);
+                set.rayCount = rays.size();
+                set.meanDepth = meanOf(depths);
+                for (const double d : depths) {
+                    set.meanTransmittance += std::exp(-d) / static_cast<double>(depths.size());
+                }
+                sweep.sets.push_back(set);
+                SetRun run(set, sweep.sets.size() - 1, rays, depths, plain.channels(), options);
+                for (const Way& way : options.ways) {
+                    volumes.of(way);  // made before anything is timed
+                    comparisons += way.isUnbiased() && way.isRandom() ? plain.channels() : 0;
+                }
+                {
+                    const Pinned pinned;
+                    for (uint32_t round = 0; round < options.rounds; ++round) {
+                        run.round(round, volumes);
+                        progress(++done / steps);
+                    }
+                }
+                run.finish(volumes, sweep.rows);
+            }
+        }
+    }
+    sweep.zBound = sidakBound(comparisons);
+    return sweep;
+}
+
+}  // namespace vdbtools

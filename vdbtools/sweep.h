@@ -1,0 +1,158 @@
+// SPDX-License-Identifier: Apache-2.0
+// What each way of estimating transmittance costs and buys on a volume: time, look-ups, variance.
+#pragma once
+
+#include "bake.h"
+#include "io/density.h"
+#include "track/track.h"
+#include "volume.h"
+
+#include <array>
+#include <cstdint>
+#include <functional>
+#include <memory>
+#include <string>
+#include <vector>
+
+namespace vdbtools {
+
+/// A density that volumes of many extinctions are made over.
+struct Source {
+    trk::DensitySummary summary;
+    std::shared_ptr<const trk::ExtinctionField> field;
+};
+
+/// A way to estimate. What a method has no use for is 0.
+struct Way {
+    TrkMethod method = TRK_METHOD_EXACT;
+    trk::ControlKind kind = trk::ControlKind::kConstant;
+    TrkChoice choice = TRK_CHOICE_ROBUST;
+    int size = 0;     ///< of super-voxels, in voxels; kWholeVolume: one over everything
+    double rate = 1;  ///< of residual, ratio and delta; of march: voxels a step
+
+    static constexpr int kWholeVolume = -1;
+
+    bool usesControl() const {
+        return method == TRK_METHOD_RESIDUAL || method == TRK_METHOD_CONTROL;
+    }
+    bool usesSuperVoxels() const {
+        return method != TRK_METHOD_EXACT && method != TRK_METHOD_MARCH;
+    }
+    bool isUnbiased() const { return method != TRK_METHOD_CONTROL && method != TRK_METHOD_MARCH; }
+    bool isRandom() const { return method != TRK_METHOD_EXACT && method != TRK_METHOD_CONTROL; }
+};
+bool operator==(const Way& a, const Way& b);
+
+/// "residual, affine robust, size 8, rate 1".
+std::string nameOf(const Way& way);
+
+enum class RayKind {
+    kCamera,    ///< coherent: a camera's, pixel after pixel
+    kSecondary  ///< incoherent: from where camera rays collide, in all directions, in random order
+};
+
+/// Rays and the extinction they go through.
+struct SweepSet {
+    RayKind rays = RayKind::kCamera;
+    bool coloured = false;
+    double depth = 0;  ///< mean optical depth of the camera rays that was asked for; 0: scale 1
+    float scale = 1;
+    double meanDepth = 0;  ///< of these rays, over channels
+    double meanTransmittance = 0;
+    size_t rayCount = 0;  ///< all of them hit
+};
+
+/// Less than this is told apart by nobody.
+inline constexpr double kLeastVariance = 0.001;
+
+/// What one way did on one set. Per ray and estimate; variances and errors are means over rays and
+/// channels.
+struct SweepRow {
+    size_t set = 0;
+    Way way;
+    double nanoseconds = 0;  ///< median over the rounds
+    double spread = 0;       ///< middle half of the rounds' times, over the median
+    double lookups = 0;
+    double superVoxels = 0;
+    double exactShare = 0;  ///< of the length, integrated exactly
+    /// Of one estimate: measured, or predicted where that is more, as a formula knows of tails that
+    /// a sample misses; for methods without noise 0.
+    double variance = 0;
+    /// By the formula of the method, which knows no roulette; NaN where there is none.
+    double predictedVariance = 0;
+    double bias = 0;  ///< mean estimate - exact
+    double rmse = 0;  ///< of one estimate against the exact value
+    double z = 0;  ///< bias in standard errors, of the channel with the largest; NaN without noise
+    /// Whether the sample shows its own mean and variance: no single estimate makes more than 5 %
+    /// of the sum of estimates, or of squared errors, and the predicted variance is not above twice
+    /// the measured one, both plus kLeastVariance.
+    bool converged = true;
+
+    /// (elsewhere + variance) x time, in ns: what it costs a renderer that has variance `elsewhere`
+    /// from other sources to get rid of both.
+    double score(double elsewhere) const { return (elsewhere + rmse * rmse) * nanoseconds; }
+};
+
+struct SweepBake {
+    int size = 0;
+    trk::ControlKind kind = trk::ControlKind::kConstant;
+    double seconds = 0;
+    uint64_t superVoxels = 0;
+    uint64_t sidecarBytes = 0;
+    double residualShare = 0;  ///< root mean square of the residual over that of the density
+};
+
+struct SweepOptions {
+    std::vector<double> depths{1, 10, 100, 0};  ///< as SweepSet::depth
+    std::vector<RayKind> rays{RayKind::kCamera, RayKind::kSecondary};
+    float scale = 1;                        ///< the volume's own
+    std::array<float, 3> color{{1, 1, 1}};  ///< of the coloured sets
+    bool grey = true;                       ///< sets without `color`
+    bool coloured = true;                   ///< sets with it
+    std::vector<Way> ways;
+    uint32_t rounds = 64;  ///< estimates a ray and way
+    size_t rayCount = 1000;
+    uint64_t seed = 0;
+};
+
+struct Sweep {
+    std::vector<SweepSet> sets;
+    std::vector<SweepRow> rows;  ///< of a set, one a way, in the order of the options
+    std::vector<SweepBake> bakes;
+    double unscaledDepth = 0;  ///< mean optical depth of the camera rays at scale 1, untinted
+    double zBound = 0;         ///< largest |z| to expect of all rows together, at 1 % [Sidak67]
+};
+
+/// The ways that `vdbtrack measure` compares by default, from what may vary.
+std::vector<Way> sweepWays(const std::vector<TrkMethod>& methods,
+                           const std::vector<trk::ControlKind>& kinds,
+                           const std::vector<TrkChoice>& choices, const std::vector<int>& sizes,
+                           const std::vector<double>& rates);
+
+/// z beyond which one of `comparisons` true hypotheses falls with probability 0.01 [Sidak67].
+double sidakBound(size_t comparisons);
+
+/// Bakes in parallel, then measures in this thread, pinned to a processor: in every round each way
+/// estimates every ray once, in an order of its own, so that what else the machine does hits all
+/// alike. Numbers but times are the same in every run. `progress(fraction)` is called now and then.
+/// Throws Error where the density is empty.
+Sweep runSweep(const Source& source, const SweepOptions& options,
+               const std::function<void(double)>& progress);
+
+/// Rays of an iso view of the volume, on a jittered grid of pixels, those that hit: about `count`.
+std::vector<TrkRay> cameraRays(const trk::Volume& volume, size_t count, uint64_t seed);
+
+/// Over rays and channels.
+double meanOpticalDepth(const trk::Volume& volume, const std::vector<TrkRay>& rays);
+
+/// Rays that start where light from `rays` collides, one a ray, in all directions, shuffled.
+std::vector<TrkRay> secondaryRays(const trk::Volume& volume, const std::vector<TrkRay>& rays,
+                                  uint64_t seed);
+
+/// Per channel, the variance of one estimate of residual or ratio tracking as `query` asks for it,
+/// but without roulette: T^2 (exp(integral of residual^2 / rate) - 1) over what is not integrated
+/// exactly [Novak14]. The method must be one of the two.
+std::array<double, 3> predictVariance(const trk::Volume& volume, const TrkQuery& query,
+                                      const TrkRay& ray);
+
+}  // namespace vdbtools

@@ -1,14 +1,11 @@
 // SPDX-License-Identifier: Apache-2.0
 #include "sweep.h"
 
-#include "batch.h"
-#include "camera.h"
 #include "error.h"
-#include "estimators/ratio_tracking.h"
 #include "io/sidecar.h"
-#include "names.h"
+#include "predicted_variance.h"
+#include "sweep_rays.h"
 #include "transmittance.h"
-#include "variant.h"
 
 #include <sched.h>
 #include <tbb/parallel_for.h>
@@ -16,7 +13,6 @@
 #include <algorithm>
 #include <chrono>
 #include <cmath>
-#include <cstdio>
 #include <filesystem>
 #include <limits>
 #include <map>
@@ -63,116 +59,10 @@ double secondsSince(std::chrono::steady_clock::time_point start) {
     return std::chrono::duration<double>(std::chrono::steady_clock::now() - start).count();
 }
 
-TrkQuery oneThread(TrkMethod method) {
-    TrkQuery query = trkDefaultQuery();
-    query.method = method;
-    query.threads = 1;
-    query.rayStride = sizeof(TrkRay);
-    return query;
-}
-
-/// Exact optical depths, `channels` a ray.
-std::vector<double> exactDepths(const Volume& volume, const std::vector<TrkRay>& rays) {
-    std::vector<double> depths(rays.size() * volume.channels());
-    TrkQuery query = oneThread(TRK_METHOD_EXACT);
-    query.threads = 0;
-    trk::integrateOpticalDepth(volume, query, rays.data(), rays.size(), depths.data());
-    return depths;
-}
-
 double meanOf(const std::vector<double>& values) {
     return values.empty() ? 0
                           : std::accumulate(values.begin(), values.end(), 0.0) /
                                 static_cast<double>(values.size());
-}
-
-/// Rays through the cells of an n x n grid of pixels, one somewhere in each, row by row.
-std::vector<TrkRay> pixelRays(const Camera& camera, size_t n, uint64_t seed) {
-    std::mt19937_64 random(seed);
-    std::uniform_real_distribution<double> unit(0, 1);
-    std::vector<TrkRay> rays;
-    rays.reserve(n * n);
-    for (size_t i = 0; i < n * n; ++i) {
-        const double x = static_cast<double>(i % n) + unit(random);
-        const double y = static_cast<double>(i / n) + unit(random);
-        rays.push_back(camera.ray(x / static_cast<double>(n), y / static_cast<double>(n), 1));
-    }
-    return rays;
-}
-
-std::vector<TrkRay> thoseThatHit(const Volume& volume, const std::vector<TrkRay>& rays) {
-    const std::vector<double> depths = exactDepths(volume, rays);
-    const size_t channels = volume.channels();
-    std::vector<TrkRay> hits;
-    for (size_t i = 0; i < rays.size(); ++i) {
-        const auto* depth = &depths[i * channels];
-        if (std::any_of(depth, depth + channels, [](double d) { return d > 0; })) {
-            hits.push_back(rays[i]);
-        }
-    }
-    return hits;
-}
-
-/// Integral of g over [t0, t1] by four Gauss points: exact for polynomials of degree 7.
-template <class G>
-double integrateGauss(double t0, double t1, const G& g) {
-    constexpr double kNodes[2] = {0.33998104358485626480, 0.86113631159405257522};
-    constexpr double kWeights[2] = {0.65214515486254614263, 0.34785484513745385737};
-    const double half = 0.5 * (t1 - t0);
-    const double middle = 0.5 * (t1 + t0);
-    double sum = 0;
-    for (int i = 0; i < 2; ++i) {
-        sum += kWeights[i] * (g(middle - half * kNodes[i]) + g(middle + half * kNodes[i]));
-    }
-    return half * sum;
-}
-
-/// Per channel, the integral of residual^2 / rate over what is tracked.
-template <class V, class Method>
-std::array<double, V::kChannels> integrateNoise(const Volume& volume, const TrkQuery& query,
-                                                const trk::ClippedRay& clipped) {
-    constexpr size_t C = V::kChannels;
-    const trk::TrackingSettings settings = trk::trackingSettings(query, clipped.lengthPerVoxel);
-    const typename V::Extinction field(volume);
-    const typename V::Walk superVoxels{volume.tracked()};
-    const trk::LocalRay& ray = clipped.local;
-    std::array<double, C> sum{};
-    superVoxels.walk(ray, 0, ray.tEnd, [&](const auto& v, double t0, double t1) {
-        double rate = 0;
-        for (size_t c = 0; c < C; ++c) {
-            rate = std::max(rate, settings.rate * Method::rate(v, c, settings.rateBase));
-        }
-        const double expected = rate * settings.lengthPerVoxel * (t1 - t0);
-        if (rate == 0 || (settings.exactFallback && expected > trk::exactCost(ray, t1 - t0))) {
-            return true;
-        }
-        const auto add = [&](double a, double b, bool empty) {
-            for (size_t c = 0; c < C; ++c) {
-                if (C == 1 || Method::rate(v, c, settings.rateBase) > 0) {
-                    sum[c] += settings.lengthPerVoxel / rate * integrateGauss(a, b, [&](double t) {
-                                  const trk::Vec3d p = ray.at(t);
-                                  const double mu = empty ? 0 : field.extinction(p)[c];
-                                  const double residual = mu - Method::control(v, c, p);
-                                  return residual * residual;
-                              });
-                }
-            }
-        };
-        double done = t0;
-        field.forEachCell(ray, t0, t1, [&](double tEnter, double tExit, const auto&) {
-            if (tEnter > done) {
-                add(done, tEnter, true);  // nothing there, but perhaps a control
-            }
-            add(tEnter, tExit, false);
-            done = tExit;
-            return true;
-        });
-        if (t1 > done) {
-            add(done, t1, true);
-        }
-        return true;
-    });
-    return sum;
 }
 
 /// Volumes over one density and one extinction, by what distinguishes their super-voxels.
@@ -226,7 +116,10 @@ struct Tally {
 };
 
 TrkQuery queryOf(const Way& way, uint64_t seed, uint64_t stream) {
-    TrkQuery query = oneThread(way.method);
+    TrkQuery query = trkDefaultQuery();
+    query.method = way.method;
+    query.threads = 1;
+    query.rayStride = sizeof(TrkRay);
     query.seed = seed;
     query.stream = stream;
     if (way.method == TRK_METHOD_MARCH) {
@@ -460,83 +353,6 @@ SweepBake bakeInto(Volumes::Bakes& bakes, const Source& source, int size, Contro
 
 }  // namespace
 
-bool operator==(const Way& a, const Way& b) {
-    return std::tie(a.method, a.kind, a.choice, a.size, a.rate) ==
-           std::tie(b.method, b.kind, b.choice, b.size, b.rate);
-}
-
-std::string nameOf(const Way& way) {
-    std::string name = kMethodNames[static_cast<size_t>(way.method)];
-    if (way.usesControl()) {
-        name += std::string(", ") + trk::controlName(way.kind);
-    }
-    if (way.method == TRK_METHOD_RESIDUAL) {
-        name += " " + kChoiceNames[static_cast<size_t>(way.choice)];
-    }
-    if (way.usesSuperVoxels()) {
-        name +=
-            way.size == Way::kWholeVolume ? ", whole volume" : ", size " + std::to_string(way.size);
-    }
-    char number[40] = "";
-    if (way.method == TRK_METHOD_MARCH) {
-        std::snprintf(number, sizeof(number), ", step %g", way.rate);
-    } else if (way.isRandom()) {
-        std::snprintf(number, sizeof(number), ", rate %g", way.rate);
-    }
-    return name + number;
-}
-
-std::vector<Way> sweepWays(const std::vector<TrkMethod>& methods,
-                           const std::vector<ControlKind>& kinds,
-                           const std::vector<TrkChoice>& choices, const std::vector<int>& sizes,
-                           const std::vector<double>& rates) {
-    std::vector<Way> ways;
-    const auto add = [&](const Way& way) {
-        if (std::find(ways.begin(), ways.end(), way) == ways.end()) {
-            ways.push_back(way);
-        }
-    };
-    for (const TrkMethod method : methods) {
-        Way way;
-        way.method = method;
-        if (!way.usesSuperVoxels()) {
-            for (const double step : {1.0, 4.0}) {
-                way.rate = method == TRK_METHOD_MARCH ? step : 1;
-                add(way);
-            }
-            continue;
-        }
-        for (const int size : sizes) {
-            way.size = size;
-            const bool whole = size == Way::kWholeVolume;
-            for (const ControlKind kind : kinds) {
-                // What is made of the whole volume is constant; ratio and delta have no control.
-                const bool constant = whole || !way.usesControl();
-                way.kind = constant ? ControlKind::kConstant : kind;
-                if (method == TRK_METHOD_CONTROL) {
-                    if (!whole) {
-                        add(way);
-                    }
-                    continue;
-                }
-                for (const TrkChoice choice : choices) {
-                    const bool constantOnly = choice == TRK_CHOICE_MIN || choice == TRK_CHOICE_MAX;
-                    if (constantOnly && way.kind != ControlKind::kConstant) {
-                        continue;
-                    }
-                    way.choice = way.usesControl() ? choice : TrkChoice{TRK_CHOICE_ROBUST};
-                    for (const double rate : rates) {
-                        // A looser majorant only costs delta tracking time.
-                        way.rate = method == TRK_METHOD_DELTA ? 1 : rate;
-                        add(way);
-                    }
-                }
-            }
-        }
-    }
-    return ways;
-}
-
 double sidakBound(size_t comparisons) {
     const double alpha =
         -std::expm1(std::log(0.99) / static_cast<double>(std::max(comparisons, size_t{1})));
@@ -547,106 +363,6 @@ double sidakBound(size_t comparisons) {
         (std::erfc(middle / std::sqrt(2.0)) > alpha ? lo : hi) = middle;
     }
     return lo;
-}
-
-std::array<double, 3> predictVariance(const Volume& volume, const TrkQuery& query,
-                                      const TrkRay& ray) {
-    std::array<double, 3> result{};
-    const auto clipped = volume.clip(ray, volume.field->box());
-    if (!clipped) {
-        return result;
-    }
-    std::array<double, 3> depth{};
-    TrkQuery exact = oneThread(TRK_METHOD_EXACT);
-    trk::integrateOpticalDepth(volume, exact, &ray, 1, depth.data());
-    const bool residual = query.method == TRK_METHOD_RESIDUAL;
-    trk::withVariant(
-        volume, residual ? volume.tracked().kind() : ControlKind::kConstant, [&](auto variant) {
-            using V = decltype(variant);
-            const auto noise =
-                residual ? integrateNoise<V, trk::ResidualControl>(volume, query, *clipped)
-                         : integrateNoise<V, trk::NoControl>(volume, query, *clipped);
-            for (size_t c = 0; c < V::kChannels; ++c) {
-                // Together, as the second factor alone may be too large.
-                result[c] = noise[c] > 1
-                                ? std::exp(noise[c] - 2 * depth[c]) - std::exp(-2 * depth[c])
-                                : std::exp(-2 * depth[c]) * std::expm1(noise[c]);
-            }
-        });
-    return result;
-}
-
-std::vector<TrkRay> cameraRays(const Volume& volume, size_t count, uint64_t seed) {
-    Camera camera = namedView("iso");
-    WorldBox box;
-    trk::worldBounds(volume.indexToWorld, volume.anchor, volume.field->box(), box.lo.x, box.hi.x);
-    frameBox(camera, box, 1);
-    // How many pixels it takes depends on how much of the picture is hit. Where that is next to
-    // nothing, fewer rays must do.
-    auto n = static_cast<size_t>(std::ceil(std::sqrt(2 * static_cast<double>(count))));
-    const size_t most = std::max(n, size_t{2048});
-    std::vector<TrkRay> rays = thoseThatHit(volume, pixelRays(camera, n, seed));
-    while (n < most && rays.size() < count / 4) {
-        n = std::min(2 * n, most);
-        rays = thoseThatHit(volume, pixelRays(camera, n, seed));
-    }
-    if (rays.empty()) {
-        return rays;
-    }
-    const double share = static_cast<double>(rays.size()) / static_cast<double>(n * n);
-    n = std::min(most,
-                 static_cast<size_t>(std::ceil(std::sqrt(static_cast<double>(count) / share))));
-    return thoseThatHit(volume, pixelRays(camera, n, seed));
-}
-
-std::vector<TrkRay> secondaryRays(const Volume& volume, const std::vector<TrkRay>& rays,
-                                  uint64_t seed) {
-    std::mt19937_64 random(seed);
-    std::uniform_real_distribution<double> unit(0, 1);
-    std::normal_distribution<double> normal;
-    const std::vector<double> depths = exactDepths(volume, rays);
-    const size_t channels = volume.channels();
-    std::vector<TrkRay> result;
-    for (size_t i = 0; i < rays.size(); ++i) {
-        const auto clipped = volume.clip(rays[i], volume.field->box());
-        if (!clipped) {
-            continue;
-        }
-        // A collision of the densest channel, given that there is one: the optical depth it lies
-        // at, then where that is.
-        const double* own = depths.data() + i * channels;
-        const double* densest = std::max_element(own, own + channels);
-        const double target = -std::log1p(unit(random) * std::expm1(-*densest));
-        TrkRay ray = rays[i];
-        double lo = clipped->tStart;
-        double hi = clipped->tStart + clipped->tPerVoxel * clipped->local.tEnd;
-        const TrkQuery query = oneThread(TRK_METHOD_EXACT);
-        for (int k = 0; k < 40; ++k) {
-            const double middle = 0.5 * (lo + hi);
-            ray.tMax = static_cast<float>(middle);
-            double found[3];
-            trk::integrateOpticalDepth(volume, query, &ray, 1, found);
-            (found[densest - own] < target ? lo : hi) = middle;
-        }
-        TrkRay secondary{};
-        trk::Vec3d direction;
-        do {
-            direction = {{normal(random), normal(random), normal(random)}};
-        } while (length(direction) < 1e-3);
-        for (int a = 0; a < 3; ++a) {
-            secondary.origin[a] = ray.origin[a] + static_cast<float>(lo) * ray.direction[a];
-            secondary.direction[a] = static_cast<float>(direction[a] / length(direction));
-        }
-        secondary.tMax = std::numeric_limits<float>::infinity();
-        result.push_back(secondary);
-    }
-    result = thoseThatHit(volume, result);
-    std::shuffle(result.begin(), result.end(), random);
-    return result;
-}
-
-double meanOpticalDepth(const Volume& volume, const std::vector<TrkRay>& rays) {
-    return meanOf(exactDepths(volume, rays));
 }
 
 Sweep runSweep(const Source& source, const SweepOptions& options,
@@ -661,7 +377,7 @@ Sweep runSweep(const Source& source, const SweepOptions& options,
                                                     ": expected some density, found none on " +
                                                     "any ray; there is nothing to measure");
     }
-    sweep.unscaledDepth = meanOpticalDepth(unscaled, camera);
+    sweep.unscaledDepth = meanOf(exactOpticalDepths(unscaled, camera));
 
     Volumes::Bakes bakes;
     for (const Way& way : options.ways) {
@@ -706,7 +422,7 @@ Sweep runSweep(const Source& source, const SweepOptions& options,
                                          ": no secondary ray meets any density at scale " +
                                          std::to_string(set.scale));
                 }
-                const std::vector<double> depths = exactDepths(plain, rays);
+                const std::vector<double> depths = exactOpticalDepths(plain, rays);
                 set.rayCount = rays.size();
                 set.meanDepth = meanOf(depths);
                 for (const double d : depths) {

@@ -6,12 +6,12 @@
 #include "io/density.h"
 #include "track/track.h"
 #include "volume.h"
+#include "way.h"
 
 #include <array>
 #include <cstdint>
 #include <functional>
 #include <memory>
-#include <string>
 #include <vector>
 
 namespace vdbtools {
@@ -21,30 +21,6 @@ struct Source {
     trk::DensitySummary summary;
     std::shared_ptr<const trk::ExtinctionField> field;
 };
-
-/// A way to estimate. What a method has no use for is 0.
-struct Way {
-    TrkMethod method = TRK_METHOD_EXACT;
-    trk::ControlKind kind = trk::ControlKind::kConstant;
-    TrkChoice choice = TRK_CHOICE_ROBUST;
-    int size = 0;     ///< of super-voxels, in voxels; kWholeVolume: one over everything
-    double rate = 1;  ///< of residual, ratio and delta; of march: voxels a step
-
-    static constexpr int kWholeVolume = -1;
-
-    bool usesControl() const {
-        return method == TRK_METHOD_RESIDUAL || method == TRK_METHOD_CONTROL;
-    }
-    bool usesSuperVoxels() const {
-        return method != TRK_METHOD_EXACT && method != TRK_METHOD_MARCH;
-    }
-    bool isUnbiased() const { return method != TRK_METHOD_CONTROL && method != TRK_METHOD_MARCH; }
-    bool isRandom() const { return method != TRK_METHOD_EXACT && method != TRK_METHOD_CONTROL; }
-};
-bool operator==(const Way& a, const Way& b);
-
-/// "residual, affine robust, size 8, rate 1".
-std::string nameOf(const Way& way);
 
 enum class RayKind {
     kCamera,    ///< coherent: a camera's, pixel after pixel
@@ -123,12 +99,6 @@ struct Sweep {
     double zBound = 0;         ///< largest |z| to expect of all rows together, at 1 % [Sidak67]
 };
 
-/// The ways that `vdbtrack measure` compares by default, from what may vary.
-std::vector<Way> sweepWays(const std::vector<TrkMethod>& methods,
-                           const std::vector<trk::ControlKind>& kinds,
-                           const std::vector<TrkChoice>& choices, const std::vector<int>& sizes,
-                           const std::vector<double>& rates);
-
 /// z beyond which one of `comparisons` true hypotheses falls with probability 0.01 [Sidak67].
 double sidakBound(size_t comparisons);
 
@@ -138,21 +108,5 @@ double sidakBound(size_t comparisons);
 /// Throws Error where the density is empty.
 Sweep runSweep(const Source& source, const SweepOptions& options,
                const std::function<void(double)>& progress);
-
-/// Rays of an iso view of the volume, on a jittered grid of pixels, those that hit: about `count`.
-std::vector<TrkRay> cameraRays(const trk::Volume& volume, size_t count, uint64_t seed);
-
-/// Over rays and channels.
-double meanOpticalDepth(const trk::Volume& volume, const std::vector<TrkRay>& rays);
-
-/// Rays that start where light from `rays` collides, one a ray, in all directions, shuffled.
-std::vector<TrkRay> secondaryRays(const trk::Volume& volume, const std::vector<TrkRay>& rays,
-                                  uint64_t seed);
-
-/// Per channel, the variance of one estimate of residual or ratio tracking as `query` asks for it,
-/// but without roulette: T^2 (exp(integral of residual^2 / rate) - 1) over what is not integrated
-/// exactly [Novak14]. The method must be one of the two.
-std::array<double, 3> predictVariance(const trk::Volume& volume, const TrkQuery& query,
-                                      const TrkRay& ray);
 
 }  // namespace vdbtools

@@ -1,0 +1,109 @@
+// SPDX-License-Identifier: Apache-2.0
+#include "predicted_variance.h"
+
+#include "batch.h"
+#include "estimators/ratio_tracking.h"
+#include "sweep_rays.h"
+#include "variant.h"
+
+#include <algorithm>
+#include <cmath>
+#include <cstddef>
+#include <vector>
+
+namespace vdbtools {
+namespace {
+
+using trk::ControlKind;
+using trk::Volume;
+
+/// Integral of g over [t0, t1] by four Gauss points: exact for polynomials of degree 7.
+template <class G>
+double integrateGauss(double t0, double t1, const G& g) {
+    constexpr double kNodes[2] = {0.33998104358485626480, 0.86113631159405257522};
+    constexpr double kWeights[2] = {0.65214515486254614263, 0.34785484513745385737};
+    const double half = 0.5 * (t1 - t0);
+    const double middle = 0.5 * (t1 + t0);
+    double sum = 0;
+    for (int i = 0; i < 2; ++i) {
+        sum += kWeights[i] * (g(middle - half * kNodes[i]) + g(middle + half * kNodes[i]));
+    }
+    return half * sum;
+}
+
+/// Per channel, the integral of residual^2 / rate over what is tracked.
+template <class V, class Method>
+std::array<double, V::kChannels> integrateNoise(const Volume& volume, const TrkQuery& query,
+                                                const trk::ClippedRay& clipped) {
+    constexpr size_t C = V::kChannels;
+    const trk::TrackingSettings settings = trk::trackingSettings(query, clipped.lengthPerVoxel);
+    const typename V::Extinction field(volume);
+    const typename V::Walk superVoxels{volume.tracked()};
+    const trk::LocalRay& ray = clipped.local;
+    std::array<double, C> sum{};
+    superVoxels.walk(ray, 0, ray.tEnd, [&](const auto& v, double t0, double t1) {
+        double rate = 0;
+        for (size_t c = 0; c < C; ++c) {
+            rate = std::max(rate, settings.rate * Method::rate(v, c, settings.rateBase));
+        }
+        const double expected = rate * settings.lengthPerVoxel * (t1 - t0);
+        if (rate == 0 || (settings.exactFallback && expected > trk::exactCost(ray, t1 - t0))) {
+            return true;
+        }
+        const auto add = [&](double a, double b, bool empty) {
+            for (size_t c = 0; c < C; ++c) {
+                if (C == 1 || Method::rate(v, c, settings.rateBase) > 0) {
+                    sum[c] += settings.lengthPerVoxel / rate * integrateGauss(a, b, [&](double t) {
+                                  const trk::Vec3d p = ray.at(t);
+                                  const double mu = empty ? 0 : field.extinction(p)[c];
+                                  const double residual = mu - Method::control(v, c, p);
+                                  return residual * residual;
+                              });
+                }
+            }
+        };
+        double done = t0;
+        field.forEachCell(ray, t0, t1, [&](double tEnter, double tExit, const auto&) {
+            if (tEnter > done) {
+                add(done, tEnter, true);  // nothing there, but perhaps a control
+            }
+            add(tEnter, tExit, false);
+            done = tExit;
+            return true;
+        });
+        if (t1 > done) {
+            add(done, t1, true);
+        }
+        return true;
+    });
+    return sum;
+}
+
+}  // namespace
+
+std::array<double, 3> predictVariance(const Volume& volume, const TrkQuery& query,
+                                      const TrkRay& ray) {
+    std::array<double, 3> result{};
+    const auto clipped = volume.clip(ray, volume.field->box());
+    if (!clipped) {
+        return result;
+    }
+    const std::vector<double> depth = exactOpticalDepths(volume, {ray});
+    const bool residual = query.method == TRK_METHOD_RESIDUAL;
+    trk::withVariant(
+        volume, residual ? volume.tracked().kind() : ControlKind::kConstant, [&](auto variant) {
+            using V = decltype(variant);
+            const auto noise =
+                residual ? integrateNoise<V, trk::ResidualControl>(volume, query, *clipped)
+                         : integrateNoise<V, trk::NoControl>(volume, query, *clipped);
+            for (size_t c = 0; c < V::kChannels; ++c) {
+                // Together, as the second factor alone may be too large.
+                result[c] = noise[c] > 1
+                                ? std::exp(noise[c] - 2 * depth[c]) - std::exp(-2 * depth[c])
+                                : std::exp(-2 * depth[c]) * std::expm1(noise[c]);
+            }
+        });
+    return result;
+}
+
+}  // namespace vdbtools

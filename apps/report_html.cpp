@@ -283,7 +283,8 @@ void addStrips(std::ostream& out, const Report& report) {
         << digits(report.stripDepth)
         << ". An estimate is the product of the <i>control's</i> transmittance, which is known, "
            "and the <i>residual's</i>, which is estimated; here 16 estimates a pixel, without "
-           "roulette. Where the control is above the extinction, the residual's "
+           "roulette and exact integration, which would hide the noise. Where the control is above "
+           "the extinction, the residual's "
            "transmittance exceeds 1 and the noise grows. Green: not a number to show.</p>\n";
     const auto unit = [](float x) { return x; };
     const auto octaves = [](float x) { return x > 0 ? 0.5f + std::log2(x) / 6 : 0.0f; };
@@ -444,14 +445,14 @@ std::string htmlOf(const Report& report) {
         }
         out << ". <a href=\"#recommendation\">Why</a>.</p>\n";
     }
-    out << "<p>Every unbiased way was checked against the exact value: " << tested
+    out << "<p>Every unbiased way that converged was checked against the exact value: " << tested
         << " rows, largest |z| " << format("%.2f", largest) << ", of which "
         << (largest < sweep.zBound ? "none" : "one or more") << " exceeds "
         << format("%.2f", sweep.zBound) << ", the bound for all of them together (Šidák, 1 %). "
         << unconverged
         << " rows are marked <i>not converged</i>: a single estimate carries more than 5 % of the "
            "sum, or the formula knows of variance that the sample does not show. They rank "
-           "nowhere.</p>\n";
+           "nowhere, and nothing is said of their bias.</p>\n";
 
     out << "<h2 id=\"trade\">Time against error</h2>\n<p>One point a way: control, choice, size "
            "and "

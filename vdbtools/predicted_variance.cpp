@@ -47,7 +47,8 @@ std::array<double, V::kChannels> integrateNoise(const Volume& volume, const TrkQ
             rate = std::max(rate, settings.rate * Method::rate(v, c, settings.rateBase));
         }
         const double expected = rate * settings.lengthPerVoxel * (t1 - t0);
-        if (rate == 0 || (settings.exactFallback && expected > trk::exactCost(ray, t1 - t0))) {
+        if (rate == 0 || expected > (settings.exactFallback ? trk::exactCost(ray, t1 - t0)
+                                                            : trk::kMostLookups)) {
             return true;
         }
         const auto add = [&](double a, double b, bool empty) {

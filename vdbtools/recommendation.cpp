@@ -57,6 +57,15 @@ double costOver(const Sweep& sweep, const std::vector<size_t>& sets, const Way& 
     return std::exp(sum / static_cast<double>(sets.size()));
 }
 
+/// " at size 16" where that is what all sets' baselines have.
+std::string sizeOfBaselines(const Sweep& sweep, const std::vector<size_t>& sets, TrkMethod method) {
+    const int size = baseline(sweep, sets.front(), method)->way.size;
+    const bool same = std::all_of(sets.begin(), sets.end(), [&](size_t set) {
+        return baseline(sweep, set, method)->way.size == size;
+    });
+    return same && size > 0 ? " at size " + std::to_string(size) : "";
+}
+
 /// The simplest of those that cost about as little as the first.
 const Ranked& simplest(const std::vector<Ranked>& ranked) {
     constexpr double kEqual = 1.03;
@@ -242,7 +251,7 @@ std::vector<Advice> recommend(const Sweep& sweep) {
             const SweepRow* base = baseline(sweep, 0, method);
             if (!std::isnan(cost) && !(base->way == way)) {
                 against += (against.empty() ? ", " : " and ") + digits(cost) + " of " + name +
-                           " tracking's";
+                           " tracking's" + sizeOfBaselines(sweep, all, method);
             }
         }
         advice.why += against + ".";

@@ -5,6 +5,7 @@
 #include "transmittance.h"
 
 #include <array>
+#include <cfloat>
 #include <cmath>
 
 namespace vdbtools {
@@ -64,7 +65,7 @@ Strip drawStrip(const Source& source, const trk::BakedVolume& baked, bool whole,
         TrkQuery query = trkDefaultQuery();
         query.rayStride = sizeof(TrkRay);
         query.samples = samples;
-        query.flags &= ~uint32_t{TRK_QUERY_ROULETTE};
+        query.flags = 0;
         const size_t channels = volume.channels();
         std::vector<float> estimates(pixels * channels);
         std::vector<TrkStatistics> statistics(pixels);
@@ -85,7 +86,9 @@ Strip drawStrip(const Source& source, const trk::BakedVolume& baked, bool whole,
             mean /= static_cast<double>(channels);
             variance /= static_cast<double>(channels);
             row.control.push_back(static_cast<float>(control));
-            row.residual.push_back(static_cast<float>(control > 0 ? mean / control : NAN));
+            const double residual = control > 0 ? mean / control : NAN;
+            row.residual.push_back(std::fabs(residual) <= FLT_MAX ? static_cast<float>(residual)
+                                                                  : NAN);
             row.product.push_back(static_cast<float>(mean));
             row.variance.push_back(static_cast<float>(variance));
         }

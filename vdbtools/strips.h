@@ -27,8 +27,8 @@ struct Strip {
 };
 
 /// Draws the iso view by residual ratio tracking with the choices min, mean, max and robust of a
-/// constant control, `samples` (>= 2) estimates a pixel, without roulette, which would hide what
-/// is shown. In parallel.
+/// constant control, `samples` (>= 2) estimates a pixel, without roulette and exact integration,
+/// which would hide what is shown. In parallel.
 Strip drawStrip(const Source& source, const trk::BakedVolume& baked, bool whole, float scale,
                 int width, uint32_t samples);
 

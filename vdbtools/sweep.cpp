@@ -2,6 +2,7 @@
 #include "sweep.h"
 
 #include "error.h"
+#include "estimators/ratio_tracking.h"
 #include "io/sidecar.h"
 #include "predicted_variance.h"
 #include "sweep_rays.h"
@@ -105,11 +106,14 @@ class Volumes {
 /// Sums over the estimates of one way on one set.
 struct Tally {
     std::vector<double> times;  ///< ns a ray, one a round
-    std::array<double, 3> errors{};
-    std::array<double, 3> squares{};
-    double largestSquare = 0;
-    double sum = 0;
-    double largest = 0;
+    struct Channel {
+        double errors = 0;
+        double squares = 0;  ///< of errors
+        double largestSquare = 0;
+        double sum = 0;
+        double largest = 0;
+    };
+    std::array<Channel, 3> channels;
     uint64_t lookups = 0;
     uint64_t superVoxels = 0;
     double exactShare = 0;
@@ -145,18 +149,24 @@ double spreadOf(std::vector<double> values) {
 /// Measures all ways on the rays of one set.
 class SetRun {
   public:
-    SetRun(const SweepSet& set, size_t setIndex, const std::vector<TrkRay>& rays,
-           const std::vector<double>& depths, size_t channels, const SweepOptions& options)
-        : set_(set),
-          index_(setIndex),
+    SetRun(size_t setIndex, const std::vector<TrkRay>& rays, const std::vector<double>& depths,
+           size_t channels, const SweepOptions& options)
+        : index_(setIndex),
           rays_(rays),
           channels_(channels),
           options_(options),
           exact_(depths.size()),
           estimates_(depths.size()),
           tallies_(options.ways.size()) {
-        std::transform(depths.begin(), depths.end(), exact_.begin(),
-                       [](double d) { return std::exp(-d); });
+        const auto rayCount = static_cast<double>(rays.size());
+        for (size_t i = 0; i < depths.size(); ++i) {
+            const double T = std::exp(-depths[i]);
+            exact_[i] = T;
+            transmittance_[i % channels] += T / rayCount;
+            if (T < trk::kRouletteThreshold) {
+                rouletteVariance_[i % channels] += (trk::kRouletteThreshold - T) * T / rayCount;
+            }
+        }
     }
 
     void round(uint32_t round, Volumes& volumes) {
@@ -186,7 +196,9 @@ class SetRun {
     }
 
   private:
-    uint64_t seedOf(size_t way) const { return options_.seed + (index_ << 20) + way; }
+    uint64_t seedOf(size_t way) const {
+        return options_.seed * 0x9e3779b97f4a7c15u + (index_ << 20) + way;
+    }
 
     /// What the estimates spend, from a few that are not timed.
     void count(const Volume& volume, TrkQuery query, Tally& tally) {
@@ -205,11 +217,12 @@ class SetRun {
         for (size_t i = 0; i < estimates_.size(); ++i) {
             const auto estimate = static_cast<double>(estimates_[i]);
             const double error = estimate - exact_[i];
-            tally.errors[i % channels_] += error;
-            tally.squares[i % channels_] += error * error;
-            tally.largestSquare = std::max(tally.largestSquare, error * error);
-            tally.sum += estimate;
-            tally.largest = std::max(tally.largest, std::fabs(estimate));
+            Tally::Channel& channel = tally.channels[i % channels_];
+            channel.errors += error;
+            channel.squares += error * error;
+            channel.largestSquare = std::max(channel.largestSquare, error * error);
+            channel.sum += estimate;
+            channel.largest = std::max(channel.largest, std::fabs(estimate));
         }
     }
 
@@ -262,21 +275,14 @@ class SetRun {
         double squares = 0;
         for (size_t c = 0; c < channels_; ++c) {
             const auto channels = static_cast<double>(channels_);
-            const double bias = tally.errors[c] / estimates;
-            const double measured = tally.squares[c] / estimates;
-            squares += measured / channels;
-            row.bias += bias / channels;
+            squares += tally.channels[c].squares / (estimates * channels);
+            row.bias += tally.channels[c].errors / (estimates * channels);
             row.predictedVariance += predicted[c] / channels;
-            if (way.isRandom()) {
-                const double variance =
-                    std::isnan(predicted[c]) ? measured : std::max(measured, predicted[c]);
-                // Results are floats, whose rounding repeats in every round.
-                constexpr double kRounding = 3e-8;
-                const double error =
-                    std::sqrt(variance / estimates + kRounding * kRounding / rayCount);
-                const double z = bias / error;
-                row.z = std::isnan(row.z) || std::fabs(z) > std::fabs(row.z) ? z : row.z;
-            }
+            row.converged = row.converged && (!way.isRandom() || converged(w, c, predicted[c]));
+        }
+        for (size_t c = 0; c < channels_ && way.isRandom() && row.converged; ++c) {
+            const double z = zOf(w, c, predicted[c]);
+            row.z = std::isnan(row.z) || std::fabs(z) > std::fabs(row.z) ? z : row.z;
         }
         if (way.isUnbiased()) {
             row.variance = !way.isRandom() ? 0 : std::fmax(squares, row.predictedVariance);
@@ -286,16 +292,34 @@ class SetRun {
             row.variance = way.isRandom() ? marchVariance(w, volumes) : 0;
             row.rmse = std::sqrt(squares);
         }
-        if (way.isRandom()) {
-            constexpr double kMost = 0.05;
-            const double sum = squares + kLeastVariance;  // a ray, over channels
-            row.converged =
-                (tally.sum > 0 || set_.meanTransmittance == 0) &&
-                tally.largest <= kMost * tally.sum &&
-                tally.largestSquare <= kMost * sum * estimates * static_cast<double>(channels_) &&
-                !(row.predictedVariance + kLeastVariance > 2 * sum);
-        }
         return row;
+    }
+
+    /// As SweepRow::converged says, of one channel.
+    bool converged(size_t w, size_t c, double predicted) const {
+        constexpr double kMost = 0.05;
+        const Tally::Channel& channel = tallies_[w].channels[c];
+        const double estimates = static_cast<double>(rays_.size()) * options_.rounds;
+        const double square = channel.squares / estimates + kLeastVariance;
+        return (channel.sum > 0 || transmittance_[c] == 0) &&
+               channel.largest <= kMost * channel.sum &&
+               channel.largestSquare <= kMost * square * estimates &&
+               !(predicted + kLeastVariance > 2 * square);
+    }
+
+    /// The error of a channel's mean, in standard errors.
+    double zOf(size_t w, size_t c, double predicted) const {
+        const Tally::Channel& channel = tallies_[w].channels[c];
+        const auto rayCount = static_cast<double>(rays_.size());
+        const double estimates = rayCount * options_.rounds;
+        const TrkMethod method = options_.ways[w].method;
+        const bool roulette = method == TRK_METHOD_RESIDUAL || method == TRK_METHOD_RATIO;
+        const double variance = std::fmax(channel.squares / estimates,
+                                          predicted + (roulette ? rouletteVariance_[c] : 0));
+        // Results are floats, whose rounding repeats in every round.
+        constexpr double kRounding = 3e-8;
+        return channel.errors / estimates /
+               std::sqrt(variance / estimates + kRounding * kRounding / rayCount);
     }
 
     /// The mean over rays of the variance around each ray's own mean, which is not the exact value.
@@ -319,12 +343,13 @@ class SetRun {
 
     static constexpr uint32_t kCounted = 4;
 
-    const SweepSet& set_;
     size_t index_;
     const std::vector<TrkRay>& rays_;
     size_t channels_;
     const SweepOptions& options_;
-    std::vector<double> exact_;  // transmittance
+    std::vector<double> exact_;                 // transmittance
+    std::array<double, 3> transmittance_{};     // mean, per channel
+    std::array<double, 3> rouletteVariance_{};  // at most, of dim rays that are else exact
     std::vector<float> estimates_;
     std::vector<Tally> tallies_;
 };
@@ -429,10 +454,9 @@ Sweep runSweep(const Source& source, const SweepOptions& options,
                     set.meanTransmittance += std::exp(-d) / static_cast<double>(depths.size());
                 }
                 sweep.sets.push_back(set);
-                SetRun run(set, sweep.sets.size() - 1, rays, depths, plain.channels(), options);
+                SetRun run(sweep.sets.size() - 1, rays, depths, plain.channels(), options);
                 for (const Way& way : options.ways) {
                     volumes.of(way);  // made before anything is timed
-                    comparisons += way.isUnbiased() && way.isRandom() ? plain.channels() : 0;
                 }
                 {
                     const Pinned pinned;
@@ -441,7 +465,13 @@ Sweep runSweep(const Source& source, const SweepOptions& options,
                         progress(++done / steps);
                     }
                 }
+                const size_t first = sweep.rows.size();
                 run.finish(volumes, sweep.rows);
+                for (size_t r = first; r < sweep.rows.size(); ++r) {
+                    const SweepRow& row = sweep.rows[r];
+                    const bool tested = row.way.isUnbiased() && !std::isnan(row.z);
+                    comparisons += tested ? plain.channels() : 0;
+                }
             }
         }
     }

@@ -58,10 +58,12 @@ struct SweepRow {
     double predictedVariance = 0;
     double bias = 0;  ///< mean estimate - exact
     double rmse = 0;  ///< of one estimate against the exact value
-    double z = 0;  ///< bias in standard errors, of the channel with the largest; NaN without noise
-    /// Whether the sample shows its own mean and variance: no single estimate makes more than 5 %
-    /// of the sum of estimates, or of squared errors, and the predicted variance is not above twice
-    /// the measured one, both plus kLeastVariance.
+    /// Bias in standard errors, of the channel with the largest; NaN without noise, and where the
+    /// row has not converged.
+    double z = 0;
+    /// Whether the sample shows its own mean and variance: in no channel does a single estimate
+    /// make more than 5 % of the sum of estimates, or of squared errors, or the predicted variance
+    /// more than twice the measured one, both plus kLeastVariance.
     bool converged = true;
 
     /// (elsewhere + variance) x time, in ns: what it costs a renderer that has variance `elsewhere`
@@ -96,7 +98,8 @@ struct Sweep {
     std::vector<SweepRow> rows;  ///< of a set, one a way, in the order of the options
     std::vector<SweepBake> bakes;
     double unscaledDepth = 0;  ///< mean optical depth of the camera rays at scale 1, untinted
-    double zBound = 0;         ///< largest |z| to expect of all rows together, at 1 % [Sidak67]
+    double zBound =
+        0;  ///< largest |z| to expect of all unbiased rows that have one, at 1 % [Sidak67]
 };
 
 /// z beyond which one of `comparisons` true hypotheses falls with probability 0.01 [Sidak67].

@@ -21,7 +21,8 @@ double allowedExcess(double range, double diagonal) {
 /// A root mean square as a sampling rate: unbiased as long as it is above 0 wherever `bound` is,
 /// and without weights that only a lucky sample would show.
 float rateAtLeast(double rms, float bound) {
-    return std::max(static_cast<float>(rms), kLeastRate * bound);
+    const float least = bound > 0 ? std::numeric_limits<float>::denorm_min() : 0.0f;
+    return std::max({static_cast<float>(rms), kLeastRate * bound, least});
 }
 
 }  // namespace

@@ -65,6 +65,18 @@ struct BakedVolume {
         }
         return max;
     }
+    /// The largest coefficient of a control, in magnitude.
+    double maxCoefficient() const {
+        double max = 0;
+        for (size_t i = 0; i < items.size(); ++i) {
+            const ControlPolynomial c = control(i);
+            max = std::max(max, std::fabs(c.centre));
+            for (const double slope : c.slope) {
+                max = std::max(max, std::fabs(slope));
+            }
+        }
+        return max;
+    }
 };
 
 /// What methods with a control need of one channel of a super-voxel, in extinction (1/world unit).

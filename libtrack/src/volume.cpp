@@ -31,13 +31,14 @@ std::vector<double> channelScales(const VolumeOptions& options, size_t densityCh
     return scales;
 }
 
-/// scale x color x density must stay within float, or every bound made of it is infinite.
-void checkScale(const std::vector<double>& scales, float maxDensity, const std::string& where) {
+/// scale x color x density, or control, must stay within float, or every bound made of it is
+/// infinite.
+void checkScale(const std::vector<double>& scales, const char* what, double largest,
+                const std::string& where) {
     const double scale = *std::max_element(scales.begin(), scales.end());
-    if (scale * static_cast<double>(maxDensity) >
-        static_cast<double>(std::numeric_limits<float>::max())) {
+    if (scale * largest > static_cast<double>(std::numeric_limits<float>::max())) {
         std::ostringstream line;
-        line << where << ": scale x color " << scale << " x density " << maxDensity
+        line << where << ": scale x color " << scale << " x " << what << " " << largest
              << " is more than a float holds; expected at most "
              << std::numeric_limits<float>::max();
         throw Error(TRK_ERROR_INVALID_ARGUMENT, line.str());
@@ -120,7 +121,7 @@ Volume makeVolume(const DensitySummary& summary, std::shared_ptr<const Extinctio
                   const VolumeOptions& options) {
     Volume volume;
     volume.scales = channelScales(options, field->channels());
-    checkScale(volume.scales, summary.max, summary.path);
+    checkScale(volume.scales, "density", static_cast<double>(summary.max), summary.path);
     volume.grid = summary.grid;
     volume.indexToWorld = summary.indexToWorld;
     volume.worldToIndex = summary.indexToWorld.inverse();
@@ -132,7 +133,10 @@ Volume makeVolume(const DensitySummary& summary, std::shared_ptr<const Extinctio
 
 void addSuperVoxels(Volume& volume, BakedVolume baked, const VolumeOptions& options,
                     const std::string& where) {
-    checkScale(volume.scales, baked.maxDensity(), where);
+    checkScale(volume.scales, "density", static_cast<double>(baked.maxDensity()), where);
+    if (baked.kind != ControlKind::kConstant) {
+        checkScale(volume.scales, "control (its value or slope)", baked.maxCoefficient(), where);
+    }
     const bool constantOnly = options.choice == TRK_CHOICE_MIN || options.choice == TRK_CHOICE_MAX;
     if (options.global && volume.hasDensity()) {
         const IntBox& box = volume.field->box();

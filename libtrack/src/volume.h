@@ -74,7 +74,8 @@ struct Volume {
     }
 
     size_t bytes() const {
-        return sizeof(*this) + (field ? field->bytes() : 0) + superVoxels.bytes();
+        return sizeof(*this) + (field ? field->bytes() : 0) + superVoxels.bytes() +
+               (globalSuperVoxel ? globalSuperVoxel->bytes() : 0);
     }
 
     /// Clips a world-space ray against a box of local space. Nothing where nothing is left.

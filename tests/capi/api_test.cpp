@@ -89,6 +89,29 @@ TEST(Api, RefusesAScaleThatOverflows) {
     trkCloseVolume(volume);
 }
 
+// The slopes of a control can be several times the largest density.
+TEST(Api, RefusesAScaleThatOverflowsTheControl) {
+    const std::string vdb = fixtures::cloudFile(64);
+    const float most = 0.99f * std::numeric_limits<float>::max() / fixtures::load(vdb).summary.max;
+    for (const trk::ControlKind kind :
+         {trk::ControlKind::kConstant, trk::ControlKind::kTrilinear}) {
+        const std::string sidecar = fixtures::path("slopes.track.vdb");
+        fixtures::bake(vdb, sidecar, 16, 0, kind);
+        TrkVolumeOptions options = trkDefaultVolumeOptions();
+        TrkVolume* volume = nullptr;
+        options.scale = most;
+        const TrkStatus status = trkOpenVolume(vdb.c_str(), sidecar.c_str(), &options, &volume);
+        if (kind == trk::ControlKind::kConstant) {
+            EXPECT_EQ(status, TRK_OK);
+        } else {
+            expectRefused(status, TRK_ERROR_INVALID_ARGUMENT, "control");
+            options.scale = most / 16;
+            EXPECT_EQ(trkOpenVolume(vdb.c_str(), sidecar.c_str(), &options, &volume), TRK_OK);
+        }
+        trkCloseVolume(volume);
+    }
+}
+
 TEST(Api, RefusesBadQueriesBeforeWritingAnything) {
     const track::Volume volume = openCloud();
     std::vector<TrkRay> all = cloudRays(volume, 10);

@@ -379,6 +379,28 @@ TEST(Sampling, IsBoundedWhateverTheScale) {
     }
 }
 
+// Steps of a walk that drown in what remains would never end it.
+TEST(Sampling, EndsWithoutExactIntegrationToo) {
+    const Cloud cloud;
+    const track::Volume volume = cloud.open();
+    const std::vector<TrkRay> all = rays::through(rays::boundsOf(volume.info()), 20, 20, 1);
+    TrkQuery query = trkDefaultQuery();
+    query.flags = 0;
+    query.rate = 3e38f;
+    TrkQuery exact = trkDefaultQuery();
+    exact.method = TRK_METHOD_EXACT;
+    std::vector<float> expected(all.size());
+    volume.estimateTransmittance(exact, all.data(), all.size(), expected.data());
+    for (const TrkMethod method : {TRK_METHOD_RESIDUAL, TRK_METHOD_RATIO}) {
+        query.method = method;
+        std::vector<float> transmittance(all.size());
+        volume.estimateTransmittance(query, all.data(), all.size(), transmittance.data());
+        for (size_t i = 0; i < all.size(); ++i) {
+            EXPECT_NEAR(transmittance[i], expected[i], 1e-5f);
+        }
+    }
+}
+
 TEST(Global, IsOneSuperVoxelForEveryKindOfBake) {
     for (const trk::ControlKind kind :
          {trk::ControlKind::kConstant, trk::ControlKind::kAffine, trk::ControlKind::kTrilinear}) {

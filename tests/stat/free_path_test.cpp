@@ -278,6 +278,31 @@ TEST(FreePath, WeightsMakeItThatOfEveryChannel) {
     EXPECT_GT(falseLargest, fixtures::kSanitized ? 10 : 20);
 }
 
+// Where the parameter is too coarse for the optical depth.
+TEST(FreePath, WeightsHaveTheirMeanWhereExtinctionIsHuge) {
+    const Medium medium("cloud", fixtures::cloudFile(96));
+    for (const double depth : {1e13, 1e15, 1e17}) {
+        const Scene scene(medium, 8, wayFor(ControlKind::kConstant), depth, 60, {{1, 0.6f, 0.3f}});
+        trk::PathCost cost;
+        std::array<double, 3> sum{};
+        std::array<double, 3> squares{};
+        double count = 0;
+        for (const PreparedRay& ray : scene.rays) {
+            for (const Path& path : samplePaths(scene, ray, true, kPaths / 10, 12, cost)) {
+                ++count;
+                for (size_t c = 0; c < 3; ++c) {
+                    sum[c] += path.weight[c] - 1;
+                    squares[c] += (path.weight[c] - 1) * (path.weight[c] - 1);
+                }
+            }
+        }
+        for (size_t c = 0; c < 3; ++c) {
+            EXPECT_LT(std::fabs(sum[c]), 4.5 * std::sqrt(squares[c]) + 1e-6 * count)
+                << "depth " << depth << ", channel " << c << ": mean " << 1 + sum[c] / count;
+        }
+    }
+}
+
 TEST(FreePath, DecompositionSavesTheLookupsOfTheControl) {
     // Where super-voxels have a minimum above 0.
     const auto grid =

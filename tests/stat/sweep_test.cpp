@@ -123,6 +123,27 @@ TEST(Sweep, NumbersButTimesAreTheSameInEveryRun) {
     EXPECT_NE(a.rows[1].bias, c.rows[1].bias);
 }
 
+// Where everything is integrated exactly, roulette is all the noise, and one that no walk may
+// survive: that is no bias.
+TEST(Sweep, RouletteAloneIsNoBias) {
+    SweepOptions options = smallSweep();
+    options.depths = {300};
+    options.coloured = false;
+    options.rays = {RayKind::kCamera};
+    options.rayCount = 200;
+    options.rounds = 16;
+    options.ways = {{TRK_METHOD_RATIO, ControlKind::kConstant, TRK_CHOICE_ROBUST, 16, 1},
+                    {TRK_METHOD_RESIDUAL, ControlKind::kConstant, TRK_CHOICE_ROBUST, 16, 1}};
+    const vdbtools::Source source = fixtures::loadSource(fixtures::cloudFile(64));
+    for (uint64_t seed = 0; seed < 8; ++seed) {
+        options.seed = seed;
+        for (const SweepRow& row : run(source, options).rows) {
+            EXPECT_GT(row.exactShare, 0.3);
+            EXPECT_LT(std::fabs(row.z), 3) << nameOf(row.way) << ", seed " << seed;
+        }
+    }
+}
+
 // `max` has a tail that no sample shows: it must not rank.
 TEST(Sweep, TailsThatASampleMissesAreNotConverged) {
     SweepOptions options = smallSweep();
@@ -133,6 +154,7 @@ TEST(Sweep, TailsThatASampleMissesAreNotConverged) {
     for (const SweepRow& row : sweep.rows) {
         EXPECT_EQ(row.converged, row.way.method == TRK_METHOD_EXACT)
             << row.variance << " " << row.predictedVariance;
+        EXPECT_TRUE(std::isnan(row.z));
     }
     EXPECT_EQ(vdbtools::rank(sweep, {0}, 0.01).size(), 1u);
 }
@@ -177,6 +199,10 @@ TEST(Strips, RobustHasTheLeastNoiseAndAllMeanTheSame) {
     for (size_t i = 0; i < min.product.size(); ++i) {
         ASSERT_NEAR(min.product[i], min.control[i] * min.residual[i], 1e-5f);
     }
+    // Nothing hides the noise of one control for everything.
+    const vdbtools::Strip whole =
+        vdbtools::drawStrip(source, vdbtools::bake(*source.field, bake), true, 5, 40, 16);
+    EXPECT_GT(meanOf(whole.rows[3].variance), 1e-4);
 }
 
 }  // namespace

@@ -90,7 +90,8 @@ enum {
     TRK_CHOICE_ROBUST =
         0,               /**< near the mean in thin super-voxels, near the minimum in thick ones */
     TRK_CHOICE_MEAN = 1, /**< the mean: least variance where super-voxels are thin */
-    TRK_CHOICE_MIN = 2,  /**< the minimum: no estimate above the control's transmittance */
+    TRK_CHOICE_MIN = 2,  /**< the minimum: at rate 1 on the majorant and without roulette, no
+                              estimate is above the control's transmittance */
     TRK_CHOICE_MAX = 3   /**< the maximum */
 };
 
@@ -150,10 +151,13 @@ static inline TrkVolumeOptions trkDefaultVolumeOptions(void) {
 
 /** Bits of TrkQuery.flags. */
 enum {
-    /** Integrate a super-voxel exactly where that is faster than tracking it. On by default. */
+    /** Integrate a super-voxel exactly where that is faster than tracking it. On by default.
+        Without it, the time a ray takes goes with its optical depth; from a billion look-ups in one
+        super-voxel on, that is integrated exactly all the same. */
     TRK_QUERY_EXACT_FALLBACK = 1,
-    /** End a walk early, without bias, where its product of weights is below 1/16: with
-        probability product x 16 it goes on, and counts for 1/16. On by default. */
+    /** End a walk early, without bias, where its product of weights is clearly below 1/16 (below
+        1/32, always): with probability product x 16 it goes on, and counts for 1/16. On by
+        default. */
     TRK_QUERY_ROULETTE = 2,
     /** Fill TrkFreePath.extinction. On by default; without, decomposition tracking saves the
      * look-up where the control collided. */

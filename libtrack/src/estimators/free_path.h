@@ -83,18 +83,19 @@ void sampleExactly(const Field& field, const LocalRay& ray, double t0, double t1
     if constexpr (C > 1) {
         double sum = 0;
         for (const double w : path.weight) {
-            sum += std::fabs(w);
+            sum += w;
         }
         double u = random.uniform() * sum;
         for (size_t c = 0; c < C; ++c) {
-            share[c] = std::fabs(path.weight[c]) / sum;
+            share[c] = path.weight[c] / sum;
         }
-        while (chosen + 1 < C && u >= std::fabs(path.weight[chosen])) {
-            u -= std::fabs(path.weight[chosen++]);
+        while (chosen + 1 < C && u >= path.weight[chosen]) {
+            u -= path.weight[chosen++];
         }
     }
     const double target = random.exponential() / lengthPerVoxel;
     std::array<double, C> depth{};
+    std::array<double, C> arrival{};  // in proportion to the extinction at the collision
     double tEnd = t1;
     field.forEachCell(ray, t0, t1, [&](double tEnter, double tExit, const auto& cell) {
         cost.lookups += 2;
@@ -109,7 +110,7 @@ void sampleExactly(const Field& field, const LocalRay& ray, double t0, double t1
         double hi = tExit;
         double t = tEnter + (tExit - tEnter) * (target - depth[chosen]) / cell[chosen];
         std::array<double, C> part{};
-        for (int i = 0; i < 60 && hi - lo > 1e-12 * (1 + tExit); ++i) {
+        for (int i = 0; i < 60 && hi - lo > 1e-15 * tExit; ++i) {
             uint64_t regions = 0;
             part = field.integrate(ray, tEnter, t, cost.lookups, regions);
             const double missing = target - depth[chosen] - part[chosen];
@@ -117,14 +118,18 @@ void sampleExactly(const Field& field, const LocalRay& ray, double t0, double t1
             const double slope = field.extinction(ray.at(t))[chosen];
             ++cost.lookups;
             const double next = t + missing / slope;
-            if (std::fabs(missing) <= 1e-12 * (target + cell[chosen])) {
+            if (std::fabs(missing) <= 1e-12 * target || next == t) {
                 break;
             }
             t = next > lo && next < hi ? next : 0.5 * (lo + hi);
         }
+        // Where the extinction is huge, t is too coarse for the depth; the weights need not be.
+        const std::array<double, C>& passed = part[chosen] > 0 ? part : cell;
+        const double ratio = (target - depth[chosen]) / passed[chosen];
         for (size_t c = 0; c < C; ++c) {
-            depth[c] += part[c];
+            depth[c] += ratio * passed[c];
         }
+        arrival = passed;
         path.collided = true;
         tEnd = t;
         return false;
@@ -134,6 +139,9 @@ void sampleExactly(const Field& field, const LocalRay& ray, double t0, double t1
     if (path.collided) {
         path.extinction = field.extinction(ray.at(tEnd));
         ++cost.lookups;
+        if (path.extinction[chosen] > 0) {  // not where t is too coarse to leave what is empty
+            arrival = path.extinction;
+        }
     }
     if constexpr (C > 1) {
         // Relative to the chosen channel, lest all underflow.
@@ -141,7 +149,7 @@ void sampleExactly(const Field& field, const LocalRay& ray, double t0, double t1
         double mixture = 0;
         for (size_t c = 0; c < C; ++c) {
             density[c] = std::exp(lengthPerVoxel * (depth[chosen] - depth[c])) *
-                         (path.collided ? path.extinction[c] : 1.0);
+                         (path.collided ? arrival[c] : 1.0);
             mixture += share[c] * density[c];
         }
         for (size_t c = 0; c < C && mixture > 0; ++c) {
@@ -156,8 +164,9 @@ void sampleExactly(const Field& field, const LocalRay& ray, double t0, double t1
 /// collisions need no look-up, and only the rest is tracked [Kutz17]; without, it is delta tracking
 /// [Woodcock65]. Homogeneous super-voxels need no look-up in either.
 ///
-/// In grey, both take the same decisions from the same random numbers: what decomposition saves is
-/// the look-up where a collision is the control's, if the extinction there is not wanted.
+/// In grey and at rate 1, both take the same decisions from the same random numbers: what
+/// decomposition saves is the look-up where a collision is the control's, if the extinction there
+/// is not wanted.
 ///
 /// Tentative collisions come at a rate that covers every channel. In grey they are real with
 /// probability extinction / rate, and the weight stays 1. In colour they are real with the
@@ -188,8 +197,7 @@ FreePath<Field::kChannels> sampleFreePath(const Field& field, const SuperVoxels&
         // Where a ray meets little of what the rate covers, null collisions would never end. After
         // as many as integrating exactly takes, that is what is done with the rest: having come so
         // far, how to go on is free.
-        double budget = settings.exactFallback ? exactCost(ray, voxels)
-                                               : std::numeric_limits<double>::infinity();
+        double budget = settings.exactFallback ? exactCost(ray, voxels) : kMostLookups;
         double remaining = ratePerVoxel * voxels;
         while (distance < remaining) {
             remaining -= distance;
@@ -210,11 +218,11 @@ FreePath<Field::kChannels> sampleFreePath(const Field& field, const SuperVoxels&
                 double realSum = 0;
                 double sum = 0;
                 for (size_t c = 0; c < C; ++c) {
-                    // Rounding may leave less than nothing.
-                    real[c] = ofControl ? control[c] : std::fmax(extinction[c] - control[c], 0);
-                    realSum += std::fabs(path.weight[c] * real[c]);
-                    sum += std::fabs(path.weight[c] * real[c]) +
-                           std::fabs(path.weight[c] * (part - real[c]));
+                    // Rounding may leave less than nothing, or more than everything.
+                    real[c] = ofControl ? control[c]
+                                        : std::fmin(std::fmax(extinction[c] - control[c], 0), part);
+                    realSum += path.weight[c] * real[c];
+                    sum += path.weight[c] * part;
                 }
                 const double probability = realSum / sum;
                 path.collided = random.uniform() < probability;

@@ -135,14 +135,14 @@ std::array<double, Field::kChannels> trackTransmittance(const Field& field,
         for (size_t c = 1; c < C; ++c) {
             base = std::max(base, Method::rate(v, c, settings.rateBase));
         }
-        // Where nothing is random, neither is whether the walk goes on.
+        // Where the super-voxel is homogeneous, walks do not end.
         if (settings.roulette && base > 0 && !sofar.survives(random)) {
             return false;
         }
         const double rate = base * settings.rate;
         const double ratePerVoxel = rate * settings.lengthPerVoxel;
         double remaining = ratePerVoxel * (tExit - tEnter);
-        if (settings.exactFallback && remaining > exactCost(ray, tExit - tEnter)) {
+        if (remaining > (settings.exactFallback ? exactCost(ray, tExit - tEnter) : kMostLookups)) {
             uint64_t bricks = 0;
             const auto exact = field.integrate(ray, tEnter, tExit, cost.lookups, bricks);
             for (size_t c = 0; c < C; ++c) {

@@ -30,12 +30,16 @@ struct TrackingSettings {
 };
 
 /// How many random look-ups take as long as integrating voxel lengths exactly: half a one a cell,
-/// whose values lie side by side (measured; see method.md). Whether a walk takes more is decided
-/// from its expected number, not the drawn one, which would be bias.
+/// whose values lie side by side (measured; see method.md). Whether an estimate of transmittance
+/// takes more is decided from its expected number, not the drawn one, which would be bias.
 inline double exactCost(const LocalRay& ray, double voxels) {
     const double cellsPerVoxel =
         std::fabs(ray.direction[0]) + std::fabs(ray.direction[1]) + std::fabs(ray.direction[2]);
     return 0.5 * (1 + cellsPerVoxel * voxels);
 }
+
+/// More than this many look-ups in a super-voxel are never taken, whatever is asked for: the
+/// steps of a walk would drown in the rounding of what remains, and it would never end.
+inline constexpr double kMostLookups = 1e9;
 
 }  // namespace trk

@@ -112,6 +112,9 @@ class Progress {
     mutable double last_ = 0;  // shown, in seconds since the start
 };
 
+/// A word as a shell takes it: in quotes where it needs them.
+std::string shellWord(const std::string& text);
+
 /// "1.5 MB".
 std::string byteCount(uint64_t bytes);
 

@@ -16,6 +16,7 @@
 #include <fstream>
 #include <iostream>
 #include <memory>
+#include <optional>
 
 namespace apps {
 namespace {
@@ -24,13 +25,13 @@ namespace po = boost::program_options;
 
 const std::vector<std::string> kControlNames{"constant", "trilinear", "affine"};
 
-/// "a,b,c" as parts.
+/// "a, b,c" as parts.
 std::vector<std::string> split(const std::string& text) {
     std::vector<std::string> parts(1);
     for (const char c : text) {
         if (c == ',') {
             parts.emplace_back();
-        } else {
+        } else if (c != ' ') {
             parts.back() += c;
         }
     }
@@ -100,40 +101,14 @@ vdbtools::SweepOptions sweepOptionsOf(const Arguments& arguments) {
         throw UsageError("--scale 0: expected a number > 0, or there is nothing to measure");
     }
     options.color = colorOf(arguments);
+    if (options.color == std::array<float, 3>{{0, 0, 0}}) {
+        throw UsageError("--color 0,0,0: expected some extinction, or there is nothing to measure");
+    }
     options.rounds = static_cast<uint32_t>(arguments.integer("rounds", 4, 1000000));
     options.rayCount = static_cast<size_t>(arguments.integer("ray-count", 16, 10000000));
     options.seed = arguments.get<uint64_t>("seed");
     return options;
 }
-
-/// A folder that is made where it was missing, and removed again where nothing was put into it.
-class ReportFolder {
-  public:
-    explicit ReportFolder(std::string path) : path_(std::move(path)) {
-        std::error_code error;
-        made_ = std::filesystem::create_directory(path_, error);
-        if (error || !std::filesystem::is_directory(path_)) {
-            throw trk::Error(TRK_ERROR_IO, path_ + ": expected a folder, or a place to make one: " +
-                                               (error ? error.message() : "is a file"));
-        }
-    }
-    ~ReportFolder() {
-        if (made_) {
-            std::error_code ignored;
-            std::filesystem::remove(path_, ignored);  // only where it is empty
-        }
-    }
-    ReportFolder(const ReportFolder&) = delete;
-    ReportFolder& operator=(const ReportFolder&) = delete;
-
-    std::string file(const char* name) const {
-        return (std::filesystem::path(path_) / name).string();
-    }
-
-  private:
-    std::string path_;
-    bool made_ = false;
-};
 
 void write(const trk::OutputFile& file, const std::string& text) {
     std::ofstream stream(file.path(), std::ios::binary);
@@ -144,14 +119,18 @@ void write(const trk::OutputFile& file, const std::string& text) {
     }
 }
 
-/// The super-voxels to trace paths with: those of the residual way of rate 1 that is cheapest for
-/// normal accuracy on secondary rays in colour, or else the default.
+/// The super-voxels to trace paths with: those of the residual way, `robust` at rate 1, that is
+/// cheapest for normal accuracy on secondary rays, in colour where that was measured, or else the
+/// default.
 vdbtools::BakeOptions bakeForScattering(const vdbtools::Sweep& sweep) {
     vdbtools::BakeOptions options;
     options.levels = 0;
+    const bool coloured = std::any_of(sweep.sets.begin(), sweep.sets.end(),
+                                      [](const auto& set) { return set.coloured; });
     std::vector<size_t> sets;
     for (size_t s = 0; s < sweep.sets.size(); ++s) {
-        if (sweep.sets[s].coloured && sweep.sets[s].rays == vdbtools::RayKind::kSecondary) {
+        if (sweep.sets[s].coloured == coloured &&
+            sweep.sets[s].rays == vdbtools::RayKind::kSecondary) {
             sets.push_back(s);
         }
     }
@@ -167,27 +146,42 @@ vdbtools::BakeOptions bakeForScattering(const vdbtools::Sweep& sweep) {
     return options;
 }
 
-void addScattering(const Arguments& arguments, const std::string& input, double depth,
+/// What --scatter… ask for, or nothing.
+std::optional<ScatterOptions> scatterOptionsOf(const Arguments& arguments) {
+    if (!arguments.has("scatter")) {
+        for (const char* option : {"scatter-samples", "scatter-width"}) {
+            if (arguments.given(option)) {
+                throw UsageError("--" + std::string(option) + ": of no use without --scatter");
+            }
+        }
+        return std::nullopt;
+    }
+    ScatterOptions options;
+    options.depth = static_cast<double>(arguments.get<float>("scatter"));
+    if (!(options.depth > 0 && std::isfinite(options.depth))) {
+        throw UsageError("--scatter: expected a mean optical depth > 0");
+    }
+    options.samples = static_cast<uint32_t>(arguments.integer("scatter-samples", 1, 100000));
+    options.width = arguments.integer("scatter-width", 16, 4096);
+    return options;
+}
+
+void addScattering(const Arguments& arguments, const std::string& input, ScatterOptions options,
                    Report& report) {
     const Progress progress(arguments, "tracing paths through " + input);
     const vdbtools::Source& source = report.source;
     const vdbtools::BakeOptions bakeOptions = bakeForScattering(report.sweep);
     // Has no name: it goes when this ends.
-    const trk::OutputFile sidecar(
-        (std::filesystem::temp_directory_path() / "scattering.track.vdb").string(), true);
+    const trk::OutputFile sidecar(trk::temporaryFolder() + "/scattering.track.vdb", true);
     trk::writeSidecar(sidecar, vdbtools::sidecarHeader(source.summary, bakeOptions),
                       vdbtools::bake(*source.field, bakeOptions), source.summary.anchor);
-    ScatterOptions options;
     options.vdb = input;
     options.sidecar = sidecar.path();
     options.grid = arguments.text("grid");
     options.repair = source.summary.repair;
-    options.scale = static_cast<float>(depth / report.sweep.unscaledDepth);
+    options.scale = static_cast<float>(options.depth / report.sweep.unscaledDepth);
     options.color = report.options.color;
-    options.samples = static_cast<uint32_t>(arguments.integer("scatter-samples", 1, 100000));
-    options.width = arguments.integer("scatter-width", 16, 4096);
     options.seed = report.options.seed;
-    options.depth = depth;
     options.control = std::string(trk::controlName(bakeOptions.kind)) + " robust, size " +
                       std::to_string(bakeOptions.superVoxelSize);
     report.scattering =
@@ -226,17 +220,13 @@ void run(const Command& command, const std::vector<std::string>& given) {
                           "r,g,b: the tint of the coloured sets; 1,1,1: none");
     addGridOptions(options);
     const Arguments arguments(command, given, options, {"IN.vdb"}, 1);
-    if (!arguments.has("output")) {
+    if (arguments.text("output").empty()) {
         throw UsageError("missing -o REPORT");
     }
     const std::string input = arguments.text("IN.vdb");
     Report report;
     report.options = sweepOptionsOf(arguments);
-    const bool scatter = arguments.has("scatter");
-    if (scatter &&
-        !(arguments.get<float>("scatter") > 0 && std::isfinite(arguments.get<float>("scatter")))) {
-        throw UsageError("--scatter: expected a mean optical depth > 0");
-    }
+    const std::optional<ScatterOptions> scatter = scatterOptionsOf(arguments);
     requireGnuplot();
 
     const auto start = std::chrono::steady_clock::now();
@@ -257,7 +247,7 @@ void run(const Command& command, const std::vector<std::string>& given) {
     const std::array<float, 3>& color = report.options.color;
     report.options.grey = report.source.field->channels() == 1;
     report.options.coloured = !report.options.grey || color != std::array<float, 3>{{1, 1, 1}};
-    const ReportFolder folder(arguments.text("output"));
+    const trk::OutputFolder folder(arguments.text("output"));
     const bool force = arguments.flag("force");
     trk::OutputFile csv(folder.file("measurements.csv"), force);
     trk::OutputFile json(folder.file("measurements.json"), force);
@@ -266,7 +256,14 @@ void run(const Command& command, const std::vector<std::string>& given) {
     report.input = std::filesystem::path(input).filename().string();
     report.command = "vdbtrack measure";
     for (const std::string& part : given) {
-        report.command += " " + part;
+        report.command += " " + shellWord(part);
+    }
+    report.bakeHead = "vdbtrack bake " + shellWord(input);
+    if (arguments.has("grid")) {
+        report.bakeHead += " --grid " + shellWord(arguments.text("grid"));
+    }
+    for (const char* repair : {"drop-nonfinite", "clamp-negative"}) {
+        report.bakeHead += arguments.flag(repair) ? std::string(" --") + repair : "";
     }
     {
         Progress progress(arguments, "measuring " + input);
@@ -291,8 +288,7 @@ void run(const Command& command, const std::vector<std::string>& given) {
     }
     report.advice = vdbtools::recommend(report.sweep);
     if (scatter) {
-        addScattering(arguments, input, static_cast<double>(arguments.get<float>("scatter")),
-                      report);
+        addScattering(arguments, input, *scatter, report);
     }
     report.seconds =
         std::chrono::duration<double>(std::chrono::steady_clock::now() - start).count();
@@ -314,7 +310,8 @@ const Command kMeasureCommand{
     "measure",
     "vdbtrack measure IN.vdb -o REPORT [--grid NAME] [--method LIST] [--control LIST] [--choice "
     "LIST] [--size LIST] [--rate LIST] [--depth 1,10,100,own] [--scale 1] [--color 1,0.6,0.3] "
-    "[--ray-count 1000] [--rounds 48] [--seed 0] [--scatter DEPTH] [--force]",
+    "[--ray-count 1000] [--rounds 48] [--seed 0] [--scatter DEPTH [--scatter-samples 64] "
+    "[--scatter-width 128]] [--force]",
     "Measures what each way of estimating costs and buys on this volume: a page with plots, tables "
     "and a recommendation, CSV and JSON.",
     run};

@@ -127,6 +127,11 @@ TrkQuery queryOf(const Arguments& arguments) {
     needs("step", query.method == TRK_METHOD_MARCH, "only march takes steps");
     needs("rate-base", tracksRatios, "only residual and ratio have one");
     needs("samples", !freePaths, "each ray of the file gets one path");
+    const bool tracks = tracksRatios || freePaths || query.method == TRK_METHOD_DELTA;
+    needs("rate", tracks, "only residual, ratio, delta and free paths have one");
+    needs("global", tracks, "only residual, ratio, delta and free paths walk over super-voxels");
+    needs("choice", query.method == TRK_METHOD_RESIDUAL && !freePaths, "only residual has one");
+    needs("no-roulette", tracksRatios, "only residual and ratio have one");
     if (freePaths && query.method != TRK_METHOD_RESIDUAL && query.method != TRK_METHOD_DELTA) {
         throw UsageError(
             "--free-paths: expected --method residual (decomposition tracking) or "

@@ -6,6 +6,7 @@
 
 #include <nlohmann/json.hpp>
 
+#include <algorithm>
 #include <cmath>
 #include <cstdio>
 #include <sstream>
@@ -17,6 +18,11 @@ using nlohmann::ordered_json;
 using vdbtools::SweepRow;
 using vdbtools::SweepSet;
 using vdbtools::Way;
+
+/// NaN where the row does not rank, lest a script rank it.
+double scoreOf(const SweepRow& row, const vdbtools::Accuracy& accuracy) {
+    return row.converged ? row.score(accuracy.elsewhere) : std::nan("");
+}
 
 /// Named numbers and texts of a row, in the order of the CSV's columns: one list for both files.
 ordered_json fieldsOf(const Report& report, const SweepRow& row) {
@@ -54,14 +60,14 @@ ordered_json fieldsOf(const Report& report, const SweepRow& row) {
     fields["z"] = number(row.z);
     fields["converged"] = row.converged;
     for (const vdbtools::Accuracy& accuracy : vdbtools::kAccuracies) {
-        fields["score_" + std::string(accuracy.name)] = number(row.score(accuracy.elsewhere));
+        fields["score_" + std::string(accuracy.name)] = number(scoreOf(row, accuracy));
     }
     for (const auto& [method, name] : {std::make_pair(TrkMethod{TRK_METHOD_DELTA}, "delta"),
                                        std::make_pair(TrkMethod{TRK_METHOD_RATIO}, "ratio")}) {
         const SweepRow* base = vdbtools::baseline(report.sweep, row.set, method);
         for (const vdbtools::Accuracy& accuracy : vdbtools::kAccuracies) {
             fields[std::string("cost_over_") + name + "_" + accuracy.name] =
-                base ? number(row.score(accuracy.elsewhere) / base->score(accuracy.elsewhere))
+                base ? number(scoreOf(row, accuracy) / base->score(accuracy.elsewhere))
                      : ordered_json(nullptr);
         }
     }
@@ -196,14 +202,28 @@ std::string jsonOf(const Report& report) {
     return json.dump(1, ' ', false, ordered_json::error_handler_t::replace) + "\n";
 }
 
+std::string reasonForNoAdvice(const Report& report) {
+    if (!report.advice.empty()) {
+        return "";
+    }
+    const std::vector<Way>& ways = report.options.ways;
+    return std::any_of(ways.begin(), ways.end(), [](const Way& w) { return w.isUnbiased(); })
+               ? "No way converged on all sets of rays: measure fewer depths, or more rounds or "
+                 "rays."
+               : "There is nothing to recommend: every method that was measured is biased.";
+}
+
 std::string adviceText(const Report& report) {
     std::ostringstream out;
+    if (report.advice.empty()) {
+        out << reasonForNoAdvice(report) << "\n";
+    }
     for (const vdbtools::Advice& advice : report.advice) {
         out << advice.accuracy.name << " accuracy: ";
         if (advice.bake.empty()) {
             out << "no bake; ";
         } else {
-            out << "vdbtrack bake " << advice.bake << ", then ";
+            out << report.bakeHead << " " << advice.bake << ", then ";
         }
         out << advice.query << "\n";
     }

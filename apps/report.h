@@ -15,8 +15,9 @@
 namespace apps {
 
 struct Report {
-    std::string input;    ///< base name
-    std::string command;  ///< that makes it again
+    std::string input;     ///< base name
+    std::string command;   ///< that makes it again
+    std::string bakeHead;  ///< the command that bakes what was measured, before its bake options
     vdbtools::Source source;
     vdbtools::SweepOptions options;
     vdbtools::Sweep sweep;
@@ -34,7 +35,10 @@ std::string jsonOf(const Report& report);
 /// A page without any other file: plots as SVG, pictures inside.
 std::string htmlOf(const Report& report);
 
-/// "--method …" paragraphs for a terminal.
+/// Why there is no advice; empty where there is some.
+std::string reasonForNoAdvice(const Report& report);
+
+/// The advice for a terminal, or why there is none.
 std::string adviceText(const Report& report);
 
 }  // namespace apps

@@ -107,7 +107,9 @@ std::string nameOf(const SweepSet& set, const std::array<float, 3>& color) {
     std::string name = set.rays == RayKind::kCamera ? "Camera rays" : "Secondary rays";
     name += set.depth > 0 ? ", depth " + digits(set.depth)
                           : ", scale " + digits(static_cast<double>(set.scale));
-    if (set.coloured) {
+    if (set.coloured && color == std::array<float, 3>{{1, 1, 1}}) {
+        name += ", in colour";
+    } else if (set.coloured) {
         name += ", colour " + digits(static_cast<double>(color[0])) + ", " +
                 digits(static_cast<double>(color[1])) + ", " +
                 digits(static_cast<double>(color[2]));
@@ -132,7 +134,7 @@ const std::vector<Family>& families() {
         return [kind](const Way& w) { return w.method == TRK_METHOD_RESIDUAL && w.kind == kind; };
     };
     static const std::vector<Family> all{
-        {"delta", "#7f7f7f", 1, [](const Way& w) { return w.method == TRK_METHOD_DELTA; }},
+        {"delta", "#444444", 2, [](const Way& w) { return w.method == TRK_METHOD_DELTA; }},
         {"ratio", "#1f77b4", 5, [](const Way& w) { return w.method == TRK_METHOD_RATIO; }},
         {"residual, constant", "#ff9f1c", 7, residual(trk::ControlKind::kConstant)},
         {"residual, affine", "#d62728", 9, residual(trk::ControlKind::kAffine)},
@@ -182,7 +184,9 @@ std::string plotOf(const Report& report, size_t s) {
         }
     }
     if (plot.series.empty()) {
-        return "<p>Nothing converged here: all transmittances are next to 0 or 1.</p>";
+        return "<p>Nothing to plot: no way with an error converged here. Where transmittances are "
+               "not "
+               "all next to 0 or 1, more rounds or rays help.</p>";
     }
     if (!front.points.empty()) {
         const PlotPoint& p = front.points.front();
@@ -390,8 +394,7 @@ void addScattering(std::ostream& out, const Scattering& scattering) {
 void addAdvice(std::ostream& out, const Report& report) {
     out << "<h2 id=\"recommendation\">Recommendation</h2>\n";
     if (report.advice.empty()) {
-        out << "<p>No way converged on all sets of rays: measure fewer depths, or more "
-               "rounds.</p>\n";
+        out << "<p>" << reasonForNoAdvice(report) << "</p>\n";
     }
     for (const vdbtools::Advice& a : report.advice) {
         std::string title = a.accuracy.name;
@@ -400,9 +403,9 @@ void addAdvice(std::ostream& out, const Report& report) {
             << " accuracy: " << escaped(vdbtools::nameOf(a.choice.way))
             << "</h3>\n<p>For a renderer with a variance of " << digits(a.accuracy.elsewhere)
             << " from elsewhere. "
-            << (a.bake.empty() ? "No sidecar is needed; "
-                               : "<code>vdbtrack bake " + escaped(report.input) + " " + a.bake +
-                                     "</code>, then ")
+            << (a.bake.empty()
+                    ? "No sidecar is needed; "
+                    : "<code>" + escaped(report.bakeHead + " " + a.bake) + "</code>, then ")
             << "<code>" << a.query << "</code>.</p>\n<p>" << escaped(a.why) << "</p></div>\n";
     }
 }
@@ -445,21 +448,26 @@ std::string htmlOf(const Report& report) {
         }
         out << ". <a href=\"#recommendation\">Why</a>.</p>\n";
     }
-    out << "<p>Every unbiased way that converged was checked against the exact value: " << tested
-        << " rows, largest |z| " << format("%.2f", largest) << ", of which "
-        << (largest < sweep.zBound ? "none" : "one or more") << " exceeds "
-        << format("%.2f", sweep.zBound) << ", the bound for all of them together (Šidák, 1 %). "
-        << unconverged
-        << " rows are marked <i>not converged</i>: a single estimate carries more than 5 % of the "
-           "sum, or the formula knows of variance that the sample does not show. They rank "
-           "nowhere, and nothing is said of their bias.</p>\n";
+    if (tested > 0) {
+        out << "<p>Every unbiased way that converged was checked against the exact value: "
+            << tested << " rows, largest |z| " << format("%.2f", largest) << ", of which "
+            << (largest < sweep.zBound ? "none" : "one or more") << " exceeds "
+            << format("%.2f", sweep.zBound)
+            << ", the bound for all of them together (Šidák, 1 %).</p>\n";
+    }
+    if (unconverged > 0) {
+        out << "<p>" << unconverged
+            << " rows are marked <i>not converged</i>: a single estimate carries more than 5 % of "
+               "the sum, or the formula knows of variance that the sample does not show. They rank "
+               "nowhere, and nothing is said of their bias.</p>\n";
+    }
 
     out << "<h2 id=\"trade\">Time against error</h2>\n<p>One point a way: control, choice, size "
            "and "
            "rate are under the mouse. Left and low is good. Averaging samples moves a point along "
            "a "
            "pale line; the black steps are the ways that no other unbiased one beats in both. The "
-           "dashed line is the exact method, without error. Time: median of "
+           "dotted line is the exact method, without error. Time: median of "
         << report.options.rounds
         << " rounds over all rays, one pinned thread, ways interleaved.</p>\n";
     const auto plots = [&](bool coloured) {
@@ -494,7 +502,7 @@ std::string htmlOf(const Report& report) {
            "the size nearest to 16, rate 1, where cost is (V0 + variance) × time and V0, the "
            "variance a renderer has from elsewhere, 0.1, 0.01 and 0.001; <i>of delta</i>: the "
            "normal one over delta "
-           "tracking's. Below 1 is better. Bold: nothing unbiased is both faster and better. A "
+           "tracking's. Below 1 is better. Bold: nothing unbiased is both faster and as good. A "
            "click "
            "on a heading sorts. The same numbers are in <code>measurements.csv</code> and "
            "<code>measurements.json</code>.</p>\n";

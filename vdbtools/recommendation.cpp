@@ -139,8 +139,8 @@ std::string byDepth(const Sweep& sweep, const Way& way, double elsewhere) {
         const Ranked& best = simplest(ranked);
         constexpr double kClear = 1.15;
         if (own->cost > kClear * best.cost) {
-            text += "; there " + nameOf(best.way) + " costs " + digits(best.cost / own->cost) +
-                    " of it";
+            text += "; over all its " + std::to_string(sets.size()) + " sets of rays, " +
+                    nameOf(best.way) + " costs " + digits(best.cost / own->cost) + " times as much";
         }
         text += ".";
     }
@@ -243,7 +243,8 @@ std::vector<Advice> recommend(const Sweep& sweep) {
         advice.bake = bakeOptionsOf(way);
         advice.query = queryOptionsOf(way);
         advice.why = "Over all " + std::to_string(all.size()) + " sets of rays it costs " +
-                     digits(advice.choice.cost) + " times what each set's own best does";
+                     digits(advice.choice.cost) +
+                     " times what each set's own best does (geometric mean)";
         std::string against;
         for (const auto& [method, name] : {std::make_pair(TrkMethod{TRK_METHOD_RATIO}, "ratio"),
                                            std::make_pair(TrkMethod{TRK_METHOD_DELTA}, "delta")}) {
@@ -257,9 +258,9 @@ std::vector<Advice> recommend(const Sweep& sweep) {
         advice.why += against + ".";
         const Ranked& cheapest = ranked.front();
         if (!(cheapest.way == way)) {
-            advice.why += " " + nameOf(cheapest.way) + " costs " +
+            advice.why += " The cheapest, " + nameOf(cheapest.way) + ", costs " +
                           digits(cheapest.cost / advice.choice.cost) +
-                          " of it, which is no difference: this is the simpler one.";
+                          " times as much, which is no difference: this is the simpler one.";
         } else if (ranked.size() > 1) {
             advice.why += " Next comes " + nameOf(ranked[1].way) + ", at " +
                           digits(ranked[1].cost / cheapest.cost) + " times that.";

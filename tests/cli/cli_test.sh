@@ -304,6 +304,11 @@ case_free_paths() {
     wrong "--step: of no use with --method exact" --method exact --step 2
     wrong "--step: expected a finite number of voxels" --method march --step 0
     wrong "--rate-base: of no use with --method delta" --method delta --rate-base rms
+    wrong "--rate: of no use with --method march" --method march --rate 2
+    wrong "--global: of no use with --method control" --method control --global
+    wrong "--choice: of no use with --method ratio" --method ratio --choice min
+    wrong "--choice: of no use with --free-paths" --free-paths --choice mean
+    wrong "--no-roulette: of no use with --method delta" --method delta --no-roulette
     wrong "rate-base" --rate-base loudest
 }
 
@@ -552,6 +557,36 @@ case_measure() {
     expect 0 measure $'caf\xe9.vdb' -o deep --depth 1e6 --rounds 4 --ray-count 50 --method exact,residual --size 8
     contains deep/index.html "at a mean optical depth of 10."
 
+    # What it recommends can be pasted: quoted, and of the grid that was measured.
+    mkdir -p "my clouds"
+    cp cloud.vdb "my clouds/it's one.vdb"
+    expect 0 measure "my clouds/it's one.vdb" -o "its report" --grid density --rounds 8 --ray-count 100 --depth 1 \
+        --size 8 --method delta --color 1,1,1
+    grep -o "vdbtrack bake .*, then" stderr | sed -n '1s/, then//p' >paste
+    contains paste "--grid density --size 8"
+    (eval "$(sed "s|^vdbtrack|\"$vdbtrack\"|" paste) --quiet") || fail "does not run: $(cat paste)"
+    [ -f "my clouds/it's one.track.vdb" ] || fail "no sidecar after $(cat paste)"
+    # Nothing to recommend, and why.
+    expect 0 measure cloud.vdb -o biased --rounds 4 --ray-count 20 --depth 1 --size 8 --method march --color 1,1,1
+    contains stderr "every method that was measured is biased"
+    contains biased/index.html "every method that was measured is biased"
+    # A signal leaves nothing, not even the folder.
+    "$vdbtrack" measure cloud.vdb -o cut --rounds 100000 --depth 1 2>/dev/null &
+    local measuring=$!
+    for _ in $(seq 200); do
+        [ -d cut ] && break
+        sleep 0.05
+    done
+    [ -d cut ] || fail "no folder while measuring"
+    kill -TERM $measuring
+    local status=0
+    wait $measuring || status=$?
+    [ $status = 143 ] || fail "exit $status on SIGTERM"
+    absent cut
+    TMPDIR=/nonexistent expect 1 measure cloud.vdb -o other --depth 1 --size 8
+    one_line "/nonexistent: expected a folder for temporary files (TMPDIR)"
+    absent other
+
     expect 1 measure cloud.vdb -o nowhere/report
     one_line "nowhere/report"
     expect 1 measure missing.vdb -o other
@@ -562,7 +597,8 @@ case_measure() {
     expect 2 measure cloud.vdb
     contains stderr "missing -o REPORT"
     for wrong in "--size 5" "--size 8,,4" "--method magic" "--rate 0" "--depth deep" "--rounds 1" \
-        "--choice min --control affine --method residual --size 8" "--scatter 0" "--rate 1e-50"; do
+        "--choice min --control affine --method residual --size 8" "--scatter 0" "--rate 1e-50" \
+        "--scatter 2 --scatter-width 8" "--scatter-samples 4" "--color 0,0,0"; do
         # shellcheck disable=SC2086
         expect 2 measure cloud.vdb -o other $wrong
         contains stderr "usage: vdbtrack measure"

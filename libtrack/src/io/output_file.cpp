@@ -10,6 +10,7 @@
 #include <atomic>
 #include <cerrno>
 #include <cstdio>
+#include <cstdlib>
 #include <cstring>
 #include <filesystem>
 #include <utility>
@@ -57,6 +58,46 @@ void cleanUpOutputFiles() {
             unlink(name.path);
         }
     }
+    for (const TemporaryName& name : temporaryNames) {
+        if (name.complete) {
+            rmdir(name.path);  // of a folder, where it is empty
+        }
+    }
+}
+
+OutputFolder::OutputFolder(std::string path) : path_(std::move(path)) {
+    std::error_code error;
+    made_ = std::filesystem::create_directory(path_, error);
+    if (error || !std::filesystem::is_directory(path_)) {
+        throw Error(TRK_ERROR_IO, path_ + ": expected a folder, or a place to make one: " +
+                                      (error ? error.message() : "is a file"));
+    }
+    if (made_) {
+        rememberTemporary(path_);
+    }
+}
+
+OutputFolder::~OutputFolder() {
+    if (made_) {
+        forgetTemporary(path_);
+        rmdir(path_.c_str());
+    }
+}
+
+std::string OutputFolder::file(const std::string& name) const {
+    return (std::filesystem::path(path_) / name).string();
+}
+
+std::string temporaryFolder() {
+    std::error_code error;
+    const std::filesystem::path folder = std::filesystem::temp_directory_path(error);
+    if (error) {
+        const char* named = std::getenv("TMPDIR");
+        throw Error(TRK_ERROR_IO,
+                    std::string(named ? named : "/tmp") +
+                        ": expected a folder for temporary files (TMPDIR): " + error.message());
+    }
+    return folder.string();
 }
 
 OutputFile::OutputFile(std::string target, bool force) : target_(std::move(target)), force_(force) {
@@ -66,9 +107,6 @@ OutputFile::OutputFile(std::string target, bool force) : target_(std::move(targe
     struct stat info = {};
     const bool replaces = stat(target_.c_str(), &info) == 0;
     if (replaces) {
-        if (std::filesystem::is_symlink(target_)) {  // replace what it points to, not the link
-            target_ = std::filesystem::canonical(target_).string();
-        }
         if (S_ISDIR(info.st_mode)) {
             throw Error(TRK_ERROR_IO, target_ + ": is a directory; expected a file name");
         }
@@ -76,6 +114,9 @@ OutputFile::OutputFile(std::string target, bool force) : target_(std::move(targe
             throw Error(
                 TRK_ERROR_IO,
                 target_ + ": is a device or pipe, which would be replaced; expected a file");
+        }
+        if (std::filesystem::is_symlink(target_)) {  // replace what it points to, not the link
+            target_ = std::filesystem::canonical(target_).string();
         }
         if (!force_) {
             throw Error(TRK_ERROR_IO, target_ + ": exists already; --force replaces it");

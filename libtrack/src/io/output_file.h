@@ -37,8 +37,28 @@ class OutputFile {
     int descriptor_ = -1;
 };
 
-/// Removes temporary files of this process (of eight at a time). Async-signal-safe: for handlers
-/// that end the process.
+/// A folder for output files, made where it was missing, and removed again, also by
+/// cleanUpOutputFiles(), where nothing was put into it.
+class OutputFolder {
+  public:
+    /// Throws Error (IO) where there is neither a folder nor a place to make one.
+    explicit OutputFolder(std::string path);
+    ~OutputFolder();
+    OutputFolder(const OutputFolder&) = delete;
+    OutputFolder& operator=(const OutputFolder&) = delete;
+
+    std::string file(const std::string& name) const;
+
+  private:
+    std::string path_;
+    bool made_ = false;
+};
+
+/// Where temporary files go: what TMPDIR names, or /tmp. Throws Error (IO) where that is no folder.
+std::string temporaryFolder();
+
+/// Removes temporary files, and empty folders, of this process (eight at a time).
+/// Async-signal-safe: for handlers that end the process.
 void cleanUpOutputFiles();
 
 }  // namespace trk

@@ -31,7 +31,7 @@ h1 { font-size: 1.7rem; margin: 0 0 .2rem; } h2 { font-size: 1.3rem; margin: 2.4
 p { max-width: 52rem; margin: .5rem 0; } code, .n { font-family: ui-monospace, monospace; font-size: .92em; }
 code { background: #eee; padding: .05em .3em; border-radius: 3px; overflow-wrap: anywhere; }
 .lead { color: #555; } .advice { background: #fff; border: 1px solid #ddd; border-left: 5px solid #d62728; border-radius: 6px;
-  padding: .7rem 1rem; margin: .8rem 0; } .advice p { max-width: none; } .advice h3 { margin: 0 0 .3rem; }
+  padding: .7rem 1rem; margin: .8rem 0; } .advice p { max-width: none; } .advice h3 { margin: 0 0 .3rem; } .advice ul { margin: .3rem 0; padding-left: 1.3rem; }
 .plots { display: grid; grid-template-columns: repeat(auto-fit, minmax(480px, 1fr)); gap: 1rem; }
 figure { margin: 0; background: #fff; border: 1px solid #ddd; border-radius: 6px; padding: .5rem; }
 figcaption { font-size: .9rem; padding: 0 .3rem .3rem; } svg { width: 100%; height: auto; }
@@ -406,7 +406,11 @@ void addAdvice(std::ostream& out, const Report& report) {
             << (a.bake.empty()
                     ? "No sidecar is needed; "
                     : "<code>" + escaped(report.bakeHead + " " + a.bake) + "</code>, then ")
-            << "<code>" << a.query << "</code>.</p>\n<p>" << escaped(a.why) << "</p></div>\n";
+            << "<code>" << a.query << "</code>.</p>\n<ul>";
+        for (const std::string& sentence : a.why) {
+            out << "<li>" << escaped(sentence) << "</li>\n";
+        }
+        out << "</ul></div>\n";
     }
 }
 

@@ -105,7 +105,7 @@ std::string queryOptionsOf(const Way& way) {
 }
 
 /// What the chosen way does depth by depth, and where another one is clearly better.
-std::string byDepth(const Sweep& sweep, const Way& way, double elsewhere) {
+std::vector<std::string> byDepth(const Sweep& sweep, const Way& way, double elsewhere) {
     std::vector<std::pair<double, std::vector<size_t>>> depths;
     for (size_t s = 0; s < sweep.sets.size(); ++s) {
         const double depth = sweep.sets[s].depth;
@@ -119,7 +119,7 @@ std::string byDepth(const Sweep& sweep, const Way& way, double elsewhere) {
             }
         }
     }
-    std::string text;
+    std::vector<std::string> sentences;
     for (const auto& [depth, sets] : depths) {
         const SweepRow* row = findRow(sweep, sets.front(), way);
         const std::vector<Ranked> ranked = rank(sweep, sets, elsewhere);
@@ -128,10 +128,10 @@ std::string byDepth(const Sweep& sweep, const Way& way, double elsewhere) {
         if (!row || own == ranked.end()) {
             continue;
         }
-        text += " At " + depthName(sweep.sets[sets.front()]) + " it takes " +
-                microseconds(row->nanoseconds) + " a " +
-                (sweep.sets[sets.front()].rays == RayKind::kCamera ? "camera" : "secondary") +
-                " ray";
+        std::string text =
+            "At " + depthName(sweep.sets[sets.front()]) + " it takes " +
+            microseconds(row->nanoseconds) + " a " +
+            (sweep.sets[sets.front()].rays == RayKind::kCamera ? "camera" : "secondary") + " ray";
         if (row->variance > 0) {
             text += ", with " + digits(row->lookups) + " look-ups and a standard deviation of " +
                     digits(std::sqrt(row->variance));
@@ -142,9 +142,9 @@ std::string byDepth(const Sweep& sweep, const Way& way, double elsewhere) {
             text += "; over all its " + std::to_string(sets.size()) + " sets of rays, " +
                     nameOf(best.way) + " costs " + digits(best.cost / own->cost) + " times as much";
         }
-        text += ".";
+        sentences.push_back(text + ".");
     }
-    return text;
+    return sentences;
 }
 
 }  // namespace
@@ -238,13 +238,13 @@ std::vector<Advice> recommend(const Sweep& sweep) {
         if (ranked.empty()) {
             continue;
         }
-        Advice advice{accuracy, simplest(ranked), "", "", ""};
+        Advice advice{accuracy, simplest(ranked), "", "", {}};
         const Way& way = advice.choice.way;
         advice.bake = bakeOptionsOf(way);
         advice.query = queryOptionsOf(way);
-        advice.why = "Over all " + std::to_string(all.size()) + " sets of rays it costs " +
-                     digits(advice.choice.cost) +
-                     " times what each set's own best does (geometric mean)";
+        std::string overall = "Over all " + std::to_string(all.size()) + " sets of rays it costs " +
+                              digits(advice.choice.cost) +
+                              " times what each set's own best does (geometric mean)";
         std::string against;
         for (const auto& [method, name] : {std::make_pair(TrkMethod{TRK_METHOD_RATIO}, "ratio"),
                                            std::make_pair(TrkMethod{TRK_METHOD_DELTA}, "delta")}) {
@@ -255,22 +255,23 @@ std::vector<Advice> recommend(const Sweep& sweep) {
                            " tracking's" + sizeOfBaselines(sweep, all, method);
             }
         }
-        advice.why += against + ".";
+        overall += against + ".";
         const Ranked& cheapest = ranked.front();
         if (!(cheapest.way == way)) {
-            advice.why += " The cheapest, " + nameOf(cheapest.way) + ", costs " +
-                          digits(cheapest.cost / advice.choice.cost) +
-                          " times as much, which is no difference: this is the simpler one.";
+            overall += " The cheapest, " + nameOf(cheapest.way) + ", costs " +
+                       digits(cheapest.cost / advice.choice.cost) +
+                       " times as much, which is no difference: this is the simpler one.";
         } else if (ranked.size() > 1) {
-            advice.why += " Next comes " + nameOf(ranked[1].way) + ", at " +
-                          digits(ranked[1].cost / cheapest.cost) + " times that.";
+            overall += " Next comes " + nameOf(ranked[1].way) + ", at " +
+                       digits(ranked[1].cost / cheapest.cost) + " times that.";
         }
-        advice.why += byDepth(sweep, way, accuracy.elsewhere);
+        advice.why = byDepth(sweep, way, accuracy.elsewhere);
+        advice.why.insert(advice.why.begin(), overall);
         for (const SweepBake& bake : sweep.bakes) {
             if (bake.size == way.size && bake.kind == way.kind && way.usesSuperVoxels()) {
-                advice.why += " The bake takes " + digits(1000 * bake.seconds) +
-                              " ms, its sidecar " +
-                              digits(static_cast<double>(bake.sidecarBytes) / 1000) + " kB.";
+                advice.why.push_back(
+                    "The bake takes " + digits(1000 * bake.seconds) + " ms, its sidecar " +
+                    digits(static_cast<double>(bake.sidecarBytes) / 1000) + " kB.");
             }
         }
         result.push_back(std::move(advice));

@@ -44,7 +44,7 @@ struct Advice {
     Ranked choice;
     std::string bake;   ///< the options of `vdbtrack bake`, or empty where no sidecar is needed
     std::string query;  ///< the options of `vdbtrack query`
-    std::string why;    ///< sentences
+    std::vector<std::string> why;  ///< over all sets, depth by depth, and what the bake costs
 };
 
 /// For every accuracy that some way converged for in all sets.

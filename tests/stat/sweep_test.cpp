@@ -207,10 +207,21 @@ TEST(Strips, RobustHasTheLeastNoiseAndAllMeanTheSame) {
     for (size_t i = 0; i < min.product.size(); ++i) {
         ASSERT_NEAR(min.product[i], min.control[i] * min.residual[i], 1e-5f);
     }
-    // Nothing hides the noise of one control for everything.
+    // Nothing hides the noise of one control for everything, not even where it would be faster to
+    // integrate exactly.
     const vdbtools::Strip whole =
-        vdbtools::drawStrip(source, vdbtools::bake(*source.field, bake), true, 5, 40, 16);
-    EXPECT_GT(meanOf(whole.rows[3].variance), 1e-4);
+        vdbtools::drawStrip(source, vdbtools::bake(*source.field, bake), true, 20, 40, 16);
+    double seen = 0;
+    double noisy = 0;
+    for (size_t i = 0; i < whole.rows[0].product.size(); ++i) {
+        const float T = whole.rows[0].product[i];
+        if (T > 0.01f && T < 0.9f) {
+            ++seen;
+            noisy += whole.rows[0].variance[i] > 1e-9f ? 1 : 0;
+        }
+    }
+    EXPECT_GT(seen, 20);
+    EXPECT_EQ(noisy, seen);
 }
 
 }  // namespace

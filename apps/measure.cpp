@@ -207,7 +207,7 @@ void run(const Command& command, const std::vector<std::string>& given) {
         "--scale")("scale", po::value<float>()->default_value(1.0f, "1"),
                    "the volume's own: extinction = scale x density")(
         "ray-count", po::value<int>()->default_value(1000), "camera rays that hit, about")(
-        "rounds", po::value<int>()->default_value(48),
+        "rounds", po::value<int>()->default_value(40),
         "estimates of each ray, of which each round times one")(
         "seed", po::value<uint64_t>()->default_value(0), "of the random numbers")(
         "scatter", po::value<float>(),
@@ -310,7 +310,7 @@ const Command kMeasureCommand{
     "measure",
     "vdbtrack measure IN.vdb -o REPORT [--grid NAME] [--method LIST] [--control LIST] [--choice "
     "LIST] [--size LIST] [--rate LIST] [--depth 1,10,100,own] [--scale 1] [--color 1,0.6,0.3] "
-    "[--ray-count 1000] [--rounds 48] [--seed 0] [--scatter DEPTH [--scatter-samples 64] "
+    "[--ray-count 1000] [--rounds 40] [--seed 0] [--scatter DEPTH [--scatter-samples 64] "
     "[--scatter-width 128]] [--force]",
     "Measures what each way of estimating costs and buys on this volume: a page with plots, tables "
     "and a recommendation, CSV and JSON.",

@@ -1,7 +1,7 @@
 // SPDX-License-Identifier: Apache-2.0
 #include "command_line.h"
 
-#include "error.h"
+#include "failure.h"
 
 #include <tbb/global_control.h>
 #include <unistd.h>
@@ -12,7 +12,6 @@
 #include <cstdio>
 #include <filesystem>
 #include <iostream>
-#include <memory>
 #include <mutex>
 #include <utility>
 
@@ -20,9 +19,6 @@ namespace apps {
 namespace po = boost::program_options;
 
 namespace {
-
-// TBB obeys this for as long as it lives: to the end of the process.
-std::unique_ptr<tbb::global_control> threadLimit;
 
 std::mutex progressMutex;
 
@@ -67,8 +63,11 @@ Arguments::Arguments(const Command& command, const std::vector<std::string>& arg
     }
     const int threads = integer("threads", 0, 4096);
     if (threads > 0) {
-        threadLimit = std::make_unique<tbb::global_control>(
+        // TBB obeys this for as long as it lives, and where it dies starts the threads it was kept
+        // from starting: it never does.
+        static const auto* const limit = new tbb::global_control(
             tbb::global_control::max_allowed_parallelism, static_cast<size_t>(threads));
+        static_cast<void>(limit);
     }
 }
 

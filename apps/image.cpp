@@ -1,7 +1,7 @@
 // SPDX-License-Identifier: Apache-2.0
 #include "image.h"
 
-#include "error.h"
+#include "failure.h"
 
 #include <ImfChannelList.h>
 #include <ImfFrameBuffer.h>

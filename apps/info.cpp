@@ -3,7 +3,7 @@
 #include "command_line.h"
 
 #include "bake.h"
-#include "error.h"
+#include "failure.h"
 #include "io/density.h"
 #include "io/sidecar.h"
 #include "io/vdb_file.h"

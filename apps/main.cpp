@@ -2,16 +2,18 @@
 // vdbtrack: dispatches to one file per command, and turns what they throw into exit codes.
 #include "command_line.h"
 
-#include "error.h"
+#include "failure.h"
 #include "io/output_file.h"
 
 #include <unistd.h>
 
 #include <csignal>
+#include <cstring>
 #include <exception>
 #include <iostream>
 #include <new>
 #include <string>
+#include <utility>
 #include <vector>
 
 namespace {
@@ -35,8 +37,26 @@ extern "C" void endOnSignal(int signal) {
     _exit(128 + signal);
 }
 
+/// The library speaks of its own constants; who runs the program knows its options.
+std::string inOptions(std::string message) {
+    const std::pair<const char*, const char*> words[] = {
+        {"TRK_REPAIR_DROP_NONFINITE", "--drop-nonfinite"},
+        {"TRK_REPAIR_CLAMP_NEGATIVE", "--clamp-negative"},
+        {"TRK_METHOD_EXACT", "--method exact"},
+        {"TRK_METHOD_CONTROL", "--method control"},
+        {"bake one", "make it with `vdbtrack bake`"},
+        {", and replacing it was not asked for", "; --force replaces it"}};
+    for (const auto& [library, program] : words) {
+        const size_t at = message.find(library);
+        if (at != std::string::npos) {
+            message.replace(at, std::strlen(library), program);
+        }
+    }
+    return message;
+}
+
 int fail(const std::string& message) {
-    std::cerr << "vdbtrack: error: " << message << "\n";
+    std::cerr << "vdbtrack: error: " << inOptions(message) << "\n";
     return 1;
 }
 

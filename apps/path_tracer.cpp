@@ -2,9 +2,8 @@
 #include "path_tracer.h"
 
 #include "camera.h"
+#include "parallel.h"
 #include "track/track.hpp"
-
-#include <tbb/parallel_for.h>
 
 #include <algorithm>
 #include <atomic>
@@ -12,6 +11,7 @@
 #include <cmath>
 #include <limits>
 #include <map>
+#include <numeric>
 #include <random>
 
 namespace apps {
@@ -143,7 +143,7 @@ class PathTracer {
             rays.push_back(camera_.ray((i % options_.width + 0.5) / options_.width,
                                        (i / options_.width + 0.5) / options_.width, 1));
         }
-        TrkQuery query = trkDefaultQuery();
+        track::Query query(0, 0);
         query.method = TRK_METHOD_EXACT;
         std::vector<float> light(rays.size() * channels_);
         volume_.estimateTransmittance(query, rays.data(), rays.size(), light.data());
@@ -172,11 +172,9 @@ class PathTracer {
         }
     }
 
-    TrkQuery queryFor(const std::vector<uint64_t>& ids, uint64_t seed, uint64_t stream) const {
-        TrkQuery query = trkDefaultQuery();
-        query.rayIds = ids.data();
+    track::Query queryFor(const std::vector<uint64_t>& ids, uint64_t seed, uint64_t stream) const {
+        track::Query query = track::Query::ofRays(ids.data(), stream);
         query.seed = seed;
-        query.stream = stream;
         query.threads = 1;
         return query;
     }
@@ -184,28 +182,29 @@ class PathTracer {
     /// Moves every path to where it collides; those that escape see the sky and are gone.
     void collide(std::vector<Path>& paths, std::vector<TrkRay>& rays, std::vector<uint64_t>& ids,
                  uint64_t seed, uint64_t bounce, Color* sums, Cost& cost) const {
-        std::vector<TrkFreePath> found(rays.size());
-        TrkQuery query = queryFor(ids, seed, 2 * bounce);
-        query.flags &= ~uint32_t{TRK_QUERY_EXTINCTION};
-        volume_.sampleFreePath(query, rays.data(), rays.size(), found.data());
+        track::FreePaths found(rays.size(), channels_);
+        TrkFreePaths wanted = found.view();
+        wanted.extinction = nullptr;
+        volume_.sampleFreePath(queryFor(ids, seed, 2 * bounce), rays.data(), rays.size(), wanted);
         size_t kept = 0;
         for (size_t i = 0; i < paths.size(); ++i) {
-            const TrkFreePath& f = found[i];
-            cost.free += f.lookups;
+            const float t = found.t[i];
+            cost.free += found.lookups[i];
             Path path = paths[i];
             path.incoming = directionOf(rays[i]);
             for (size_t c = 0; c < 3; ++c) {
-                path.throughput[c] *= static_cast<double>(f.weight[c]);
+                path.throughput[c] *=
+                    static_cast<double>(found.weight[channels_ == 1 ? i : 3 * i + c]);
             }
-            if (std::isinf(f.t)) {
+            if (std::isinf(t)) {
                 const float one[3] = {1, 1, 1};
                 add(path, one, 1, skyRadiance(path.incoming), sums);
                 continue;
             }
-            for (double& t : path.throughput) {
-                t *= kAlbedo;
+            for (double& throughput : path.throughput) {
+                throughput *= kAlbedo;
             }
-            rays[kept] = rayFrom(rays[i], f.t, path.incoming);
+            rays[kept] = rayFrom(rays[i], t, path.incoming);
             ids[kept] = ids[i];
             paths[kept++] = path;
         }
@@ -216,15 +215,14 @@ class PathTracer {
 
     std::vector<float> shadow(const std::vector<TrkRay>& rays, const std::vector<uint64_t>& ids,
                               TrkMethod method, uint64_t seed, uint64_t stream, Cost& cost) const {
-        TrkQuery query = queryFor(ids, seed, stream);
+        track::Query query = queryFor(ids, seed, stream);
         query.method = method;
         std::vector<float> light(rays.size() * channels_);
-        std::vector<TrkStatistics> statistics(rays.size());
-        volume_.estimateTransmittance(query, rays.data(), rays.size(), light.data(),
-                                      statistics.data());
-        for (const TrkStatistics& s : statistics) {
-            cost.shadow += s.lookups;
-        }
+        std::vector<uint64_t> lookups(rays.size());
+        TrkStatistics statistics = trkDefaultStatistics();
+        statistics.lookups = lookups.data();
+        volume_.estimateTransmittance(query, rays.data(), rays.size(), light.data(), statistics);
+        cost.shadow += std::accumulate(lookups.begin(), lookups.end(), uint64_t{0});
         return light;
     }
 
@@ -240,9 +238,10 @@ Image render(const PathTracer& tracer, const ScatterOptions& options, TrkMethod 
     std::vector<float>* channels[3] = {&image.add("R"), &image.add("G"), &image.add("B")};
     std::vector<Color> sums(image.pixelCount());
     std::atomic<int> done{0};
-    tbb::parallel_for(0, options.width, [&](int y) {
+    trk::parallelFor(static_cast<size_t>(options.width), 1, [&](size_t i) {
+        const int y = static_cast<int>(i);
         Cost cost;
-        Color* row = &sums[static_cast<size_t>(y) * static_cast<size_t>(options.width)];
+        Color* row = &sums[i * static_cast<size_t>(options.width)];
         for (uint32_t first = 0; first < samples; first += kChunk) {
             tracer.traceRow(y, first, std::min(kChunk, samples - first), method, seed, row, cost);
         }

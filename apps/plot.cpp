@@ -1,7 +1,7 @@
 // SPDX-License-Identifier: Apache-2.0
 #include "plot.h"
 
-#include "error.h"
+#include "failure.h"
 
 #include <fcntl.h>
 #include <spawn.h>

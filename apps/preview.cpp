@@ -3,7 +3,7 @@
 #include "command_line.h"
 
 #include "camera.h"
-#include "error.h"
+#include "failure.h"
 #include "image.h"
 #include "io/output_file.h"
 #include "lit_preview.h"

@@ -2,7 +2,7 @@
 // vdbtrack query: transmittance of the rays of a CSV file.
 #include "command_line.h"
 
-#include "error.h"
+#include "failure.h"
 #include "io/output_file.h"
 #include "io/sidecar.h"
 #include "names.h"
@@ -60,8 +60,8 @@ void forEachChunk(const Arguments& arguments, size_t rayCount, const Answer& ans
     }
 }
 
-std::string transmittances(const Arguments& arguments, const track::Volume& volume, TrkQuery query,
-                           const std::vector<TrkRay>& rays) {
+std::string transmittances(const Arguments& arguments, const track::Volume& volume,
+                           track::Query query, const std::vector<TrkRay>& rays) {
     const size_t channels = volume.info().channels;
     std::ostringstream out;
     out << "ray," << columns("transmittance", channels) << ',' << columns("stderr", channels) << ','
@@ -70,48 +70,48 @@ std::string transmittances(const Arguments& arguments, const track::Volume& volu
         query.method == TRK_METHOD_EXACT || query.method == TRK_METHOD_CONTROL;
     forEachChunk(arguments, rays.size(), [&](size_t begin, size_t count) {
         std::vector<float> transmittance(count * channels);
-        std::vector<TrkStatistics> statistics(count);
+        track::Statistics statistics(count, channels);
         std::vector<double> depth(count * channels, std::numeric_limits<double>::quiet_NaN());
         query.firstRayId = begin;
         volume.estimateTransmittance(query, &rays[begin], count, transmittance.data(),
-                                     statistics.data());
+                                     statistics.view());
         if (deterministic) {
             volume.integrateOpticalDepth(query, &rays[begin], count, depth.data());
         }
         for (size_t i = 0; i < count; ++i) {
             out << begin + i;
             addColumns(out, &transmittance[i * channels], channels);
-            addColumns(out, statistics[i].standardError, channels);
+            addColumns(out, &statistics.standardError[i * channels], channels);
             addColumns(out, &depth[i * channels], channels);
-            out << ',' << statistics[i].lookups << '\n';
+            out << ',' << statistics.lookups[i] << '\n';
         }
     });
     return out.str();
 }
 
-std::string freePaths(const Arguments& arguments, const track::Volume& volume, TrkQuery query,
+std::string freePaths(const Arguments& arguments, const track::Volume& volume, track::Query query,
                       const std::vector<TrkRay>& rays) {
     const size_t channels = volume.info().channels;
     std::ostringstream out;
     out << "ray,t," << columns("weight", channels) << ',' << columns("extinction", channels)
         << ",lookups\n";
     forEachChunk(arguments, rays.size(), [&](size_t begin, size_t count) {
-        std::vector<TrkFreePath> paths(count);
+        track::FreePaths paths(count, channels);
         query.firstRayId = begin;
-        volume.sampleFreePath(query, &rays[begin], count, paths.data());
+        volume.sampleFreePath(query, &rays[begin], count, paths.view());
         for (size_t i = 0; i < count; ++i) {
-            out << begin + i << ',' << number(static_cast<double>(paths[i].t));
-            addColumns(out, paths[i].weight, channels);
-            addColumns(out, paths[i].extinction, channels);
-            out << ',' << paths[i].lookups << '\n';
+            out << begin + i << ',' << number(static_cast<double>(paths.t[i]));
+            addColumns(out, &paths.weight[i * channels], channels);
+            addColumns(out, &paths.extinction[i * channels], channels);
+            out << ',' << paths.lookups[i] << '\n';
         }
     });
     return out.str();
 }
 
 /// The query that the options describe.
-TrkQuery queryOf(const Arguments& arguments) {
-    TrkQuery query = trkDefaultQuery();
+track::Query queryOf(const Arguments& arguments) {
+    track::Query query(0, arguments.get<uint64_t>("stream"));
     const std::string method = arguments.text("method");
     query.method = choiceIndex("method", method, vdbtools::kMethodNames);
     const bool freePaths = arguments.flag("free-paths");
@@ -156,7 +156,6 @@ TrkQuery queryOf(const Arguments& arguments) {
     query.flags &= arguments.flag("no-roulette") ? ~uint32_t{TRK_QUERY_ROULETTE} : ~uint32_t{0};
     query.level = static_cast<uint32_t>(arguments.integer("level", 0, 64));
     query.seed = arguments.get<uint64_t>("seed");
-    query.stream = arguments.get<uint64_t>("stream");
     return query;
 }
 
@@ -242,7 +241,7 @@ void run(const Command& command, const std::vector<std::string>& given) {
     if (!arguments.has("rays")) {
         throw UsageError("missing --rays RAYS.csv");
     }
-    const TrkQuery query = queryOf(arguments);
+    const track::Query query = queryOf(arguments);
     const TrkVolumeOptions volumeOptions = volumeOptionsOf(arguments);
     refuseInput(arguments.text("output"),
                 {arguments.text("IN.vdb"), arguments.text("rays"), arguments.text("sidecar")});

@@ -1,7 +1,7 @@
 // SPDX-License-Identifier: Apache-2.0
 #include "ray_file.h"
 
-#include "error.h"
+#include "failure.h"
 
 #include <cctype>
 #include <cerrno>

@@ -2,7 +2,7 @@
 // vdbtrack verify: proves a sidecar's bounds voxel by voxel.
 #include "command_line.h"
 
-#include "error.h"
+#include "failure.h"
 #include "io/density.h"
 #include "io/sidecar.h"
 #include "verify.h"

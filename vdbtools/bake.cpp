@@ -4,9 +4,7 @@
 #include "control_fit.h"
 #include "levels.h"
 #include "moments.h"
-
-#include <tbb/blocked_range.h>
-#include <tbb/parallel_for.h>
+#include "parallel.h"
 
 #include <algorithm>
 #include <cmath>
@@ -81,12 +79,7 @@ class Baker {
 
     template <class Body>
     static void forEach(size_t count, const Body& body) {
-        tbb::parallel_for(tbb::blocked_range<size_t>(0, count, 32),
-                          [&](const tbb::blocked_range<size_t>& range) {
-                              for (size_t i = range.begin(); i != range.end(); ++i) {
-                                  body(i);
-                              }
-                          });
+        trk::parallelFor(count, 32, body);
     }
 
     /// Moments of every cube of every brick: each vertex is read once, whatever shares its brick.

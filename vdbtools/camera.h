@@ -2,7 +2,7 @@
 // Pinhole cameras that look at a volume.
 #pragma once
 
-#include "math.h"
+#include "geometry.h"
 #include "track/track.h"
 
 #include <string>

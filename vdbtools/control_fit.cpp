@@ -2,9 +2,7 @@
 #include "control_fit.h"
 
 #include "hash.h"
-
-#include <tbb/blocked_range.h>
-#include <tbb/parallel_for.h>
+#include "parallel.h"
 
 #include <algorithm>
 #include <cmath>
@@ -144,29 +142,26 @@ void CornerFit::findParts() {
 void CornerFit::multiply(const std::vector<double>& x, std::vector<double>& result) const {
     std::fill(result.begin(), result.end(), 0.0);
     for (const std::vector<uint32_t>& cells : independent_) {
-        tbb::parallel_for(tbb::blocked_range<size_t>(0, cells.size(), 1024),
-                          [&](const tbb::blocked_range<size_t>& range) {
-                              for (size_t i = range.begin(); i != range.end(); ++i) {
-                                  const std::array<uint32_t, 8>& corners = cornersOf_[cells[i]];
-                                  double v[8];
-                                  for (size_t k = 0; k < 8; ++k) {
-                                      v[k] = x[corners[k]];
-                                  }
-                                  for (const size_t stride : {4u, 2u, 1u}) {
-                                      for (size_t k = 0; k < 8; ++k) {
-                                          if ((k & stride) == 0) {
-                                              const double a = v[k];
-                                              const double b = v[k + stride];
-                                              v[k] = diagonal_ * a + coupling_ * b;
-                                              v[k + stride] = coupling_ * a + diagonal_ * b;
-                                          }
-                                      }
-                                  }
-                                  for (size_t k = 0; k < 8; ++k) {
-                                      result[corners[k]] += v[k];
-                                  }
-                              }
-                          });
+        trk::parallelFor(cells.size(), 1024, [&](size_t i) {
+            const std::array<uint32_t, 8>& corners = cornersOf_[cells[i]];
+            double v[8];
+            for (size_t k = 0; k < 8; ++k) {
+                v[k] = x[corners[k]];
+            }
+            for (const size_t stride : {4u, 2u, 1u}) {
+                for (size_t k = 0; k < 8; ++k) {
+                    if ((k & stride) == 0) {
+                        const double a = v[k];
+                        const double b = v[k + stride];
+                        v[k] = diagonal_ * a + coupling_ * b;
+                        v[k + stride] = coupling_ * a + diagonal_ * b;
+                    }
+                }
+            }
+            for (size_t k = 0; k < 8; ++k) {
+                result[corners[k]] += v[k];
+            }
+        });
     }
 }
 

@@ -3,7 +3,7 @@
 // values over all of them together.
 #pragma once
 
-#include "math.h"
+#include "geometry.h"
 
 #include <array>
 #include <cstddef>

@@ -1,13 +1,11 @@
 // SPDX-License-Identifier: Apache-2.0
 #include "lit_preview.h"
 
-#include "error.h"
+#include "failure.h"
 #include "io/sidecar.h"
 #include "io/sidecar_schema.h"
+#include "parallel.h"
 #include "variant.h"
-
-#include <tbb/blocked_range.h>
-#include <tbb/parallel_for.h>
 
 #include <algorithm>
 #include <atomic>
@@ -219,25 +217,24 @@ void LitPreview::tabulateLight() {
             return add(origin, ExtinctionField::kBrickShift, found.entry);
         });
     light_.resize(places);
-    tbb::parallel_for(tbb::blocked_range<size_t>(0, regions_.size(), 1), [&](const auto& range) {
-        for (size_t r = range.begin(); r != range.end(); ++r) {
-            const Region& region = regions_[r];
-            const int64_t edge = region.cells + 1;
-            tbb::parallel_for(int64_t{0}, edge * edge * edge, [&](int64_t i) {
-                const Int3 at{{i / (edge * edge), i / edge % edge, i % edge}};
-                if (!isNeeded(field, region.entry, at)) {
-                    return;
-                }
-                const double spacing =
-                    std::ldexp(1.0, region.shift) / static_cast<double>(region.cells);
-                Vec3d place;
-                for (size_t a = 0; a < 3; ++a) {
-                    place[static_cast<int>(a)] =
-                        static_cast<double>(region.lo[a]) + spacing * static_cast<double>(at[a]);
-                }
-                light_[region.first + static_cast<size_t>(i)] = computeLight(place);
-            });
-        }
+    trk::parallelFor(regions_.size(), 1, [&](size_t r) {
+        const Region& region = regions_[r];
+        const int64_t edge = region.cells + 1;
+        trk::parallelFor(static_cast<size_t>(edge * edge * edge), 1, [&](size_t k) {
+            const auto i = static_cast<int64_t>(k);
+            const Int3 at{{i / (edge * edge), i / edge % edge, i % edge}};
+            if (!isNeeded(field, region.entry, at)) {
+                return;
+            }
+            const double spacing =
+                std::ldexp(1.0, region.shift) / static_cast<double>(region.cells);
+            Vec3d place;
+            for (size_t a = 0; a < 3; ++a) {
+                place[static_cast<int>(a)] =
+                    static_cast<double>(region.lo[a]) + spacing * static_cast<double>(at[a]);
+            }
+            light_[region.first + k] = computeLight(place);
+        });
     });
 }
 
@@ -379,15 +376,13 @@ Picture LitPreview::draw(const Camera& camera, int width, int height,
     picture.halfDepth.resize(pixels);
     const double aspect = static_cast<double>(width) / height;
     std::atomic<int> done{0};
-    tbb::parallel_for(tbb::blocked_range<int>(0, height, 4), [&](const auto& range) {
-        for (int row = range.begin(); row != range.end(); ++row) {
-            for (int column = 0; column < width; ++column) {
-                drawPixel(camera.ray((column + 0.5) / width, (row + 0.5) / height, aspect), picture,
-                          static_cast<size_t>(row) * static_cast<size_t>(width) +
-                              static_cast<size_t>(column));
-            }
-            progress(static_cast<double>(++done) / height);
+    trk::parallelFor(static_cast<size_t>(height), 4, [&](size_t i) {
+        const int row = static_cast<int>(i);
+        for (int column = 0; column < width; ++column) {
+            drawPixel(camera.ray((column + 0.5) / width, (row + 0.5) / height, aspect), picture,
+                      i * static_cast<size_t>(width) + static_cast<size_t>(column));
         }
+        progress(static_cast<double>(++done) / height);
     });
     return picture;
 }

@@ -1,12 +1,10 @@
 // SPDX-License-Identifier: Apache-2.0
 #include "procedural.h"
 
+#include "geometry.h"
 #include "io/density_types.h"
 #include "io/vdb_writer.h"
-#include "math.h"
-
-#include <tbb/blocked_range.h>
-#include <tbb/parallel_for.h>
+#include "parallel.h"
 
 #include <algorithm>
 #include <array>
@@ -297,24 +295,22 @@ typename GridType::Ptr makeGrid(const Shape& shape, int voxels,
         }
     };
     std::atomic<int> done{0};
-    tbb::parallel_for(tbb::blocked_range<int>(0, blocks * blocks), [&](const auto& range) {
-        for (int column = range.begin(); column != range.end(); ++column) {
-            for (int k = 0; k < blocks; ++k) {
-                const openvdb::Coord origin(8 * (column / blocks), 8 * (column % blocks), 8 * k);
-                const Vec3d centre{
-                    {(origin.x() + 4) * voxel, (origin.y() + 4) * voxel, (origin.z() + 4) * voxel}};
-                if (shape.emptyAround(centre, 7 * voxel)) {
-                    continue;
-                }
-                auto leaf = std::make_unique<Leaf>(origin, openvdb::zeroVal<Value>());
-                fill(*leaf);
-                if (!leaf->isEmpty()) {
-                    leaves[static_cast<size_t>(column) * static_cast<size_t>(blocks) +
-                           static_cast<size_t>(k)] = std::move(leaf);
-                }
+    trk::parallelFor(static_cast<size_t>(blocks * blocks), 1, [&](size_t i) {
+        const int column = static_cast<int>(i);
+        for (int k = 0; k < blocks; ++k) {
+            const openvdb::Coord origin(8 * (column / blocks), 8 * (column % blocks), 8 * k);
+            const Vec3d centre{
+                {(origin.x() + 4) * voxel, (origin.y() + 4) * voxel, (origin.z() + 4) * voxel}};
+            if (shape.emptyAround(centre, 7 * voxel)) {
+                continue;
             }
-            progress(static_cast<double>(++done) / (blocks * blocks));
+            auto leaf = std::make_unique<Leaf>(origin, openvdb::zeroVal<Value>());
+            fill(*leaf);
+            if (!leaf->isEmpty()) {
+                leaves[i * static_cast<size_t>(blocks) + static_cast<size_t>(k)] = std::move(leaf);
+            }
         }
+        progress(static_cast<double>(++done) / (blocks * blocks));
     });
     auto grid = GridType::create();
     for (auto& leaf : leaves) {

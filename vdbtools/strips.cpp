@@ -68,9 +68,11 @@ Strip drawStrip(const Source& source, const trk::BakedVolume& baked, bool whole,
         query.flags = 0;
         const size_t channels = volume.channels();
         std::vector<float> estimates(pixels * channels);
-        std::vector<TrkStatistics> statistics(pixels);
-        trk::estimateTransmittance(volume, query, rays.data(), pixels, estimates.data(),
-                                   statistics.data());
+        std::vector<float> errors(pixels * channels);
+        trk::StatisticsOutput statistics;
+        statistics.standardError = {errors.data(), channels, 0};
+        trk::estimateTransmittance(volume, query, rays.data(), pixels,
+                                   {estimates.data(), channels, 0}, statistics);
         StripRow row;
         row.choice = choice;
         for (size_t i = 0; i < pixels; ++i) {
@@ -79,7 +81,7 @@ Strip drawStrip(const Source& source, const trk::BakedVolume& baked, bool whole,
             double mean = 0;
             double variance = 0;
             for (size_t c = 0; c < channels; ++c) {
-                const auto error = static_cast<double>(statistics[i].standardError[c]);
+                const auto error = static_cast<double>(errors[i * channels + c]);
                 mean += static_cast<double>(estimates[i * channels + c]);
                 variance += std::isnan(error) ? 0 : error * error * samples;
             }

@@ -1,15 +1,15 @@
 // SPDX-License-Identifier: Apache-2.0
 #include "sweep.h"
 
-#include "error.h"
 #include "estimators/ratio_tracking.h"
+#include "failure.h"
 #include "io/sidecar.h"
+#include "parallel.h"
 #include "predicted_variance.h"
 #include "sweep_rays.h"
 #include "transmittance.h"
 
 #include <sched.h>
-#include <tbb/parallel_for.h>
 
 #include <algorithm>
 #include <chrono>
@@ -182,8 +182,8 @@ class SetRun {
                 count(volume, query, tally);
             }
             const auto start = std::chrono::steady_clock::now();
-            trk::estimateTransmittance(volume, query, rays_.data(), rays_.size(), estimates_.data(),
-                                       nullptr);
+            trk::estimateTransmittance(volume, query, rays_.data(), rays_.size(), estimatesOut(),
+                                       {});
             tally.times.push_back(1e9 * secondsSince(start) / static_cast<double>(rays_.size()));
             add(tally);
         }
@@ -202,16 +202,20 @@ class SetRun {
 
     /// What the estimates spend, from a few that are not timed.
     void count(const Volume& volume, TrkQuery query, Tally& tally) {
-        std::vector<TrkStatistics> statistics(rays_.size());
+        const size_t n = rays_.size();
+        std::vector<uint64_t> lookups(n);
+        std::vector<uint64_t> superVoxels(n);
+        std::vector<float> exactShare(n);
         query.samples = kCounted;
-        trk::estimateTransmittance(volume, query, rays_.data(), rays_.size(), estimates_.data(),
-                                   statistics.data());
-        for (const TrkStatistics& s : statistics) {
-            tally.lookups += s.lookups;
-            tally.superVoxels += s.superVoxels;
-            tally.exactShare += static_cast<double>(s.exactShare);
-        }
+        trk::estimateTransmittance(
+            volume, query, rays_.data(), n, estimatesOut(),
+            {{}, {lookups.data(), 1, 0}, {superVoxels.data(), 1, 0}, {exactShare.data(), 1, 0}});
+        tally.lookups += std::accumulate(lookups.begin(), lookups.end(), uint64_t{0});
+        tally.superVoxels += std::accumulate(superVoxels.begin(), superVoxels.end(), uint64_t{0});
+        tally.exactShare += std::accumulate(exactShare.begin(), exactShare.end(), 0.0);
     }
+
+    trk::Array<float> estimatesOut() { return {estimates_.data(), channels_, 0}; }
 
     void add(Tally& tally) {
         for (size_t i = 0; i < estimates_.size(); ++i) {
@@ -244,7 +248,7 @@ class SetRun {
         const Volume& volume = volumes.of(way);
         const TrkQuery query = queryOf(way, 0, 0);
         std::vector<std::array<double, 3>> variances(rays_.size());
-        tbb::parallel_for(size_t{0}, rays_.size(), [&](size_t i) {
+        trk::parallelFor(rays_.size(), 1, [&](size_t i) {
             variances[i] = predictVariance(volume, query, rays_[i]);
         });
         for (const auto& v : variances) {
@@ -326,19 +330,21 @@ class SetRun {
     double marchVariance(size_t w, Volumes& volumes) const {
         constexpr uint32_t kSamples = 16;
         TrkQuery query = queryOf(options_.ways[w], seedOf(w), options_.rounds);
-        query.samples = kSamples;
-        std::vector<float> means(exact_.size());
-        std::vector<TrkStatistics> statistics(rays_.size());
-        trk::estimateTransmittance(volumes.of(options_.ways[w]), query, rays_.data(), rays_.size(),
-                                   means.data(), statistics.data());
-        double sum = 0;
-        for (const TrkStatistics& s : statistics) {
-            for (size_t c = 0; c < channels_; ++c) {
-                const auto error = static_cast<double>(s.standardError[c]);
-                sum += error * error * kSamples;
+        std::vector<float> estimates(exact_.size());
+        std::vector<double> means(exact_.size());
+        std::vector<double> squares(exact_.size());
+        for (uint32_t sample = 1; sample <= kSamples; ++sample) {
+            query.stream = static_cast<uint64_t>(options_.rounds) + sample;
+            trk::estimateTransmittance(volumes.of(options_.ways[w]), query, rays_.data(),
+                                       rays_.size(), {estimates.data(), channels_, 0}, {});
+            for (size_t i = 0; i < estimates.size(); ++i) {  // [Welford 1962]
+                const double delta = static_cast<double>(estimates[i]) - means[i];
+                means[i] += delta / sample;
+                squares[i] += delta * (static_cast<double>(estimates[i]) - means[i]);
             }
         }
-        return sum / static_cast<double>(exact_.size());
+        return std::accumulate(squares.begin(), squares.end(), 0.0) / (kSamples - 1) /
+               static_cast<double>(exact_.size());
     }
 
     static constexpr uint32_t kCounted = 4;

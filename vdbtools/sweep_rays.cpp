@@ -49,7 +49,8 @@ std::vector<double> exactOpticalDepths(const Volume& volume, const std::vector<T
     TrkQuery query = trkDefaultQuery();
     query.method = TRK_METHOD_EXACT;
     query.rayStride = sizeof(TrkRay);
-    trk::integrateOpticalDepth(volume, query, rays.data(), rays.size(), depths.data());
+    trk::integrateOpticalDepth(volume, query, rays.data(), rays.size(),
+                               {depths.data(), volume.channels(), 0});
     return depths;
 }
 
@@ -105,7 +106,7 @@ std::vector<TrkRay> secondaryRays(const Volume& volume, const std::vector<TrkRay
             const double middle = 0.5 * (lo + hi);
             ray.tMax = static_cast<float>(middle);
             double found[3];
-            trk::integrateOpticalDepth(volume, query, &ray, 1, found);
+            trk::integrateOpticalDepth(volume, query, &ray, 1, {found, channels, 0});
             (found[densest - own] < target ? lo : hi) = middle;
         }
         TrkRay secondary{};

@@ -4,9 +4,7 @@
 #include "io/density_types.h"
 #include "io/tree_regions.h"
 #include "io/vdb_file.h"
-
-#include <tbb/blocked_range.h>
-#include <tbb/parallel_for.h>
+#include "parallel.h"
 
 #include <algorithm>
 #include <array>
@@ -102,17 +100,16 @@ class Verifier {
     template <class Fails>
     size_t firstFailure(size_t count, const Fails& fails) const {
         std::atomic<size_t> first{count};
-        tbb::parallel_for(tbb::blocked_range<size_t>(0, count, 16),
-                          [&](const tbb::blocked_range<size_t>& range) {
-                              Regions regions(tree_);
-                              for (size_t i = range.begin(); i != range.end(); ++i) {
-                                  if (i < first && fails(regions, i)) {
-                                      size_t known = first;
-                                      while (i < known && !first.compare_exchange_weak(known, i)) {
-                                      }
-                                  }
-                              }
-                          });
+        trk::parallelRanges(count, 16, [&](size_t begin, size_t end) {
+            Regions regions(tree_);
+            for (size_t i = begin; i != end; ++i) {
+                if (i < first && fails(regions, i)) {
+                    size_t known = first;
+                    while (i < known && !first.compare_exchange_weak(known, i)) {
+                    }
+                }
+            }
+        });
         return first;
     }
 

@@ -2,7 +2,7 @@
 // The only extern "C" file: validates, calls, and turns exceptions into statuses.
 #include "track/track.h"
 
-#include "error.h"
+#include "failure.h"
 #include "sampling.h"
 #include "transmittance.h"
 #include "volume.h"
@@ -11,6 +11,7 @@
 
 #include <algorithm>
 #include <cmath>
+#include <cstddef>
 #include <cstring>
 #include <exception>
 #include <filesystem>
@@ -58,12 +59,36 @@ TrkStatus guard(const Body& body) noexcept {
     throw trk::Error(TRK_ERROR_INVALID_ARGUMENT, message);
 }
 
-void checkSize(const char* what, size_t size, size_t expected) {
-    if (size != expected) {
+/// What the caller filled in, completed: of an older, smaller struct the rest is 0, the default of
+/// fields added later; of a newer, larger one the rest must be. `firstSize`: of the first release.
+template <class Struct>
+Struct completed(const Struct& given, const char* what, size_t firstSize) {
+    const size_t size = given.size;
+    constexpr size_t kAbsurd = 1 << 16;
+    if (size < firstSize || size > kAbsurd) {
         refuse(std::string(what) + ".size is " + std::to_string(size) + "; expected " +
-               std::to_string(expected) + ", its sizeof (the trkDefault… functions set it)");
+               std::to_string(sizeof(Struct)) + ", its sizeof");
     }
+    const auto* bytes = reinterpret_cast<const unsigned char*>(&given);
+    for (size_t i = sizeof(Struct); i < size; ++i) {
+        if (bytes[i] != 0) {
+            refuse(std::string(what) + " has a field that libtrack " TRACK_VERSION
+                                       " does not know; expected it to be 0, its default");
+        }
+    }
+    Struct result;
+    std::memset(&result, 0, sizeof(result));
+    std::memcpy(&result, &given, std::min(size, sizeof(result)));
+    result.size = sizeof(result);
+    return result;
 }
+
+// Where the structs of the first release, 0.1, end: their last fields. These never change.
+constexpr size_t kFirstVolumeOptions = offsetof(TrkVolumeOptions, threads) + sizeof(int32_t);
+constexpr size_t kFirstQuery = offsetof(TrkQuery, threads) + sizeof(int32_t);
+constexpr size_t kFirstStatistics = offsetof(TrkStatistics, exactShareStride) + sizeof(size_t);
+constexpr size_t kFirstFreePaths = offsetof(TrkFreePaths, lookupsStride) + sizeof(size_t);
+constexpr size_t kFirstVolumeInfo = offsetof(TrkVolumeInfo, storage) + sizeof(const char*);
 
 trk::VolumeOptions checked(const TrkVolumeOptions& options) {
     if (!(options.scale >= 0) || !std::isfinite(options.scale)) {
@@ -102,11 +127,22 @@ trk::VolumeOptions checked(const TrkVolumeOptions& options) {
     return result;
 }
 
-TrkQuery checked(const TrkQuery* given) {
-    if (given) {
-        checkSize("TrkQuery", given->size, sizeof(TrkQuery));
+/// A stride of 0 or of whole, properly aligned entries.
+template <class T>
+void checkStride(const char* name, size_t stride, size_t width) {
+    if (stride != 0 && (stride < width * sizeof(T) || stride % alignof(T) != 0)) {
+        refuse(std::string(name) + " is " + std::to_string(stride) +
+               "; expected 0, or a multiple of " + std::to_string(alignof(T)) + " from " +
+               std::to_string(width * sizeof(T)) + " on");
     }
-    TrkQuery query = given ? *given : trkDefaultQuery();
+}
+
+/// `method`: of the function, where no query is given.
+TrkQuery checked(const TrkQuery* given, TrkMethod method) {
+    TrkQuery query = given ? completed(*given, "TrkQuery", kFirstQuery) : trkDefaultQuery();
+    if (!given) {
+        query.method = method;
+    }
     if (query.method < TRK_METHOD_EXACT || query.method > TRK_METHOD_MARCH) {
         refuse("method is " + std::to_string(query.method) + "; expected a TRK_METHOD_ constant");
     }
@@ -127,22 +163,43 @@ TrkQuery checked(const TrkQuery* given) {
     if (!(query.step >= 0.001f) || !std::isfinite(query.step)) {
         refuse("step is " + std::to_string(query.step) + "; expected a finite number >= 0.001");
     }
-    constexpr uint32_t kFlags =
-        TRK_QUERY_EXACT_FALLBACK | TRK_QUERY_ROULETTE | TRK_QUERY_EXTINCTION;
+    constexpr uint32_t kFlags = uint32_t{TRK_QUERY_EXACT_FALLBACK} | uint32_t{TRK_QUERY_ROULETTE};
     if ((query.flags & ~kFlags) != 0) {
         refuse("flags has unknown bits; expected TRK_QUERY_ constants");
     }
     if (query.threads < 0) {
         refuse("threads is " + std::to_string(query.threads) + "; expected 0 (all) or more");
     }
+    checkStride<TrkRay>("rayStride", query.rayStride, 1);
     if (query.rayStride == 0) {
         query.rayStride = sizeof(TrkRay);
     }
-    if (query.rayStride < sizeof(TrkRay) || query.rayStride % alignof(TrkRay) != 0) {
-        refuse("rayStride is " + std::to_string(query.rayStride) + "; expected a multiple of " +
-               std::to_string(alignof(TrkRay)) + " from " + std::to_string(sizeof(TrkRay)) + " on");
-    }
     return query;
+}
+
+template <class T>
+trk::Array<T> arrayOf(const char* strideName, T* first, size_t width, size_t stride) {
+    checkStride<T>(strideName, stride, width);
+    return {first, width, stride};
+}
+
+trk::StatisticsOutput checked(const TrkStatistics* given, size_t channels) {
+    if (!given) {
+        return {};
+    }
+    const TrkStatistics s = completed(*given, "TrkStatistics", kFirstStatistics);
+    return {arrayOf("standardErrorStride", s.standardError, channels, s.standardErrorStride),
+            arrayOf("lookupsStride", s.lookups, 1, s.lookupsStride),
+            arrayOf("superVoxelsStride", s.superVoxels, 1, s.superVoxelsStride),
+            arrayOf("exactShareStride", s.exactShare, 1, s.exactShareStride)};
+}
+
+trk::FreePathOutput checked(const TrkFreePaths& given, size_t channels) {
+    const TrkFreePaths p = completed(given, "TrkFreePaths", kFirstFreePaths);
+    return {arrayOf("tStride", p.t, 1, p.tStride),
+            arrayOf("weightStride", p.weight, channels, p.weightStride),
+            arrayOf("extinctionStride", p.extinction, channels, p.extinctionStride),
+            arrayOf("lookupsStride", p.lookups, 1, p.lookupsStride)};
 }
 
 void checkPointers(const TrkVolume* volume, const void* rays, size_t rayCount,
@@ -204,11 +261,17 @@ TrkStatus trkOpenVolume(const char* vdbPath, const char* sidecarPath,
             refuse("volume is NULL; expected where to put the opened volume");
         }
         *volume = nullptr;
-        if (options) {
-            // Before the copy: a caller's older struct may be shorter than ours.
-            checkSize("TrkVolumeOptions", options->size, sizeof(TrkVolumeOptions));
+        const TrkVolumeOptions given =
+            options ? completed(*options, "TrkVolumeOptions", kFirstVolumeOptions)
+                    : trkDefaultVolumeOptions();
+        if (vdbPath && *vdbPath == '\0') {
+            refuse("vdbPath is empty; expected the path of a density, or NULL for a sidecar alone");
         }
-        const TrkVolumeOptions given = options ? *options : trkDefaultVolumeOptions();
+        if (!vdbPath && (!sidecarPath || *sidecarPath == '\0')) {
+            refuse(
+                "vdbPath is NULL, and sidecarPath names no sidecar either; expected the path of at "
+                "least one");
+        }
         const trk::VolumeOptions opened = checked(given);
         const auto open = [&] {
             *volume = new TrkVolume{trk::openVolume(vdbPath, sidecarPath, opened)};
@@ -231,10 +294,14 @@ TrkStatus trkGetVolumeInfo(const TrkVolume* handle, TrkVolumeInfo* info) {
         if (!handle || !info) {
             refuse("volume or info is NULL");
         }
-        checkSize("TrkVolumeInfo", info->size, sizeof(TrkVolumeInfo));
+        const size_t size = info->size;
+        if (size < kFirstVolumeInfo) {
+            refuse("TrkVolumeInfo.size is " + std::to_string(size) + "; expected " +
+                   std::to_string(sizeof(TrkVolumeInfo)) + ", its sizeof, set before the call");
+        }
         const trk::Volume& volume = handle->volume;
         TrkVolumeInfo result{};
-        result.size = sizeof(TrkVolumeInfo);
+        result.size = size;
         const trk::IntBox& box =
             volume.hasDensity() ? volume.field->box() : volume.superVoxels.box();
         trk::worldBounds(volume.indexToWorld, volume.anchor, box, result.boundsMin,
@@ -258,17 +325,25 @@ TrkStatus trkGetVolumeInfo(const TrkVolume* handle, TrkVolumeInfo* info) {
             result.levels = static_cast<uint32_t>(volume.superVoxels.levelCount());
             result.controlKind = trk::controlName(volume.superVoxels.kind());
         }
-        *info = result;
+        std::memcpy(info, &result, std::min(size, sizeof(result)));
+        if (size > sizeof(result)) {  // what a newer header adds
+            std::memset(reinterpret_cast<unsigned char*>(info) + sizeof(result), 0,
+                        size - sizeof(result));
+        }
     });
 }
 
 TrkStatus trkEstimateTransmittance(const TrkVolume* volume, const TrkQuery* query,
                                    const TrkRay* rays, size_t rayCount, float* transmittance,
-                                   TrkStatistics* statistics) {
+                                   const TrkStatistics* statistics) {
     return guard([&] {
         checkPointers(volume, rays, rayCount, transmittance);
-        trk::estimateTransmittance(volume->volume, checked(query), rays, rayCount, transmittance,
-                                   statistics);
+        const TrkQuery complete = checked(query, TRK_METHOD_RESIDUAL);
+        const size_t channels = volume->volume.channels();
+        trk::estimateTransmittance(
+            volume->volume, complete, rays, rayCount,
+            arrayOf("resultStride", transmittance, channels, complete.resultStride),
+            checked(statistics, channels));
     });
 }
 
@@ -276,21 +351,23 @@ TrkStatus trkIntegrateOpticalDepth(const TrkVolume* volume, const TrkQuery* quer
                                    const TrkRay* rays, size_t rayCount, double* opticalDepth) {
     return guard([&] {
         checkPointers(volume, rays, rayCount, opticalDepth);
-        const TrkQuery complete = checked(query);
+        const TrkQuery complete = checked(query, TRK_METHOD_EXACT);
         if (complete.method != TRK_METHOD_EXACT && complete.method != TRK_METHOD_CONTROL) {
             refuse("method " + std::to_string(complete.method) +
                    " is random and has no optical depth; expected TRK_METHOD_EXACT or "
                    "TRK_METHOD_CONTROL");
         }
-        trk::integrateOpticalDepth(volume->volume, complete, rays, rayCount, opticalDepth);
+        trk::integrateOpticalDepth(volume->volume, complete, rays, rayCount,
+                                   arrayOf("resultStride", opticalDepth, volume->volume.channels(),
+                                           complete.resultStride));
     });
 }
 
 TrkStatus trkSampleFreePath(const TrkVolume* volume, const TrkQuery* query, const TrkRay* rays,
-                            size_t rayCount, TrkFreePath* results) {
+                            size_t rayCount, const TrkFreePaths* paths) {
     return guard([&] {
-        checkPointers(volume, rays, rayCount, results);
-        const TrkQuery complete = checked(query);
+        checkPointers(volume, rays, rayCount, paths);
+        const TrkQuery complete = checked(query, TRK_METHOD_RESIDUAL);
         if (complete.method != TRK_METHOD_RESIDUAL && complete.method != TRK_METHOD_DELTA) {
             refuse("method " + std::to_string(complete.method) +
                    " has no free paths; expected TRK_METHOD_RESIDUAL or TRK_METHOD_DELTA");
@@ -303,12 +380,20 @@ TrkStatus trkSampleFreePath(const TrkVolume* volume, const TrkQuery* query, cons
             refuse("samples is " + std::to_string(complete.samples) +
                    "; expected 1: give other streams or ray ids for more paths of a ray");
         }
-        trk::sampleFreePaths(volume->volume, complete, rays, rayCount, results);
+        if (rayCount == 0) {
+            return;
+        }
+        const trk::FreePathOutput out = checked(*paths, volume->volume.channels());
+        if (!out.t) {
+            refuse("TrkFreePaths.t is NULL; expected room for " + std::to_string(rayCount) +
+                   " floats");
+        }
+        trk::sampleFreePaths(volume->volume, complete, rays, rayCount, out);
     });
 }
 
 TrkStatus trkSampleExtinction(const TrkVolume* volume, const float* points, size_t pointStride,
-                              size_t pointCount, float* extinction) {
+                              size_t pointCount, float* extinction, size_t extinctionStride) {
     return guard([&] {
         if (!volume) {
             refuse("volume is NULL");
@@ -317,11 +402,8 @@ TrkStatus trkSampleExtinction(const TrkVolume* volume, const float* points, size
             refuse("points or extinction is NULL; expected " + std::to_string(pointCount) +
                    " points");
         }
-        const size_t stride = pointStride == 0 ? 3 * sizeof(float) : pointStride;
-        if (stride < 3 * sizeof(float) || stride % alignof(float) != 0) {
-            refuse("pointStride is " + std::to_string(pointStride) +
-                   "; expected a multiple of 4 from 12 on");
-        }
-        trk::sampleExtinction(volume->volume, points, stride, pointCount, extinction);
+        trk::sampleExtinction(
+            volume->volume, arrayOf("pointStride", points, 3, pointStride), pointCount,
+            arrayOf("extinctionStride", extinction, volume->volume.channels(), extinctionStride));
     });
 }

@@ -1,7 +1,7 @@
 // SPDX-License-Identifier: Apache-2.0
 #include "batch.h"
 
-#include "error.h"
+#include "failure.h"
 
 #include <cmath>
 #include <string>
@@ -37,7 +37,7 @@ void requireDensity(const Volume& volume) {
         throw Error(TRK_ERROR_NO_DENSITY,
                     volume.sidecarPath +
                         ": opened without its density, which this looks up; open the density's "
-                        ".vdb too, or use the control method");
+                        ".vdb too, or use TRK_METHOD_CONTROL");
     }
 }
 
@@ -46,7 +46,7 @@ void requireSuperVoxels(const Volume& volume) {
         throw Error(TRK_ERROR_NO_SIDECAR,
                     "grid " + volume.grid.name + ": this needs a sidecar, and none was found" +
                         (volume.sidecarPath.empty() ? "" : " at " + volume.sidecarPath) +
-                        "; make it with `vdbtrack bake`, or use the exact method");
+                        "; bake one, or use TRK_METHOD_EXACT");
     }
 }
 

@@ -3,16 +3,16 @@
 #pragma once
 
 #include "estimators/tracking.h"
+#include "parallel.h"
 #include "track/track.h"
 #include "volume.h"
 
-#include <tbb/blocked_range.h>
-#include <tbb/parallel_for.h>
 #include <tbb/task_arena.h>
 
 #include <algorithm>
 #include <cstddef>
 #include <cstdint>
+#include <type_traits>
 
 namespace trk {
 
@@ -20,6 +20,27 @@ inline const TrkRay& rayAt(const TrkQuery& query, const TrkRay* rays, size_t i) 
     return *reinterpret_cast<const TrkRay*>(reinterpret_cast<const unsigned char*>(rays) +
                                             i * query.rayStride);
 }
+
+/// An array of the caller, or none. `width`: values a ray; `stride`: bytes from ray to ray, 0
+/// for none in between.
+template <class T>
+class Array {
+  public:
+    Array() = default;
+    Array(T* first, size_t width, size_t stride)
+        : first_(first), stride_(stride == 0 ? width * sizeof(T) : stride) {}
+
+    explicit operator bool() const { return first_ != nullptr; }
+    T* at(size_t ray) const {
+        return reinterpret_cast<T*>(reinterpret_cast<Byte*>(first_) + ray * stride_);
+    }
+
+  private:
+    using Byte = std::conditional_t<std::is_const_v<T>, const unsigned char, unsigned char>;
+
+    T* first_ = nullptr;
+    size_t stride_ = 0;
+};
 
 inline uint64_t rayIdAt(const TrkQuery& query, size_t i) {
     return query.rayIds ? query.rayIds[i] : query.firstRayId + i;
@@ -32,7 +53,6 @@ inline TrackingSettings trackingSettings(const TrkQuery& query, double lengthPer
     settings.rateBase = query.rateBase == TRK_RATE_BASE_RMS ? RateBase::kRms : RateBase::kMajorant;
     settings.exactFallback = (query.flags & TRK_QUERY_EXACT_FALLBACK) != 0;
     settings.roulette = (query.flags & TRK_QUERY_ROULETTE) != 0;
-    settings.wantsExtinction = (query.flags & TRK_QUERY_EXTINCTION) != 0;
     return settings;
 }
 
@@ -55,14 +75,7 @@ void forEachRay(const TrkQuery& query, size_t rayCount, const Body& body) {
     const auto run = [&] {
         // Isolated: a thread that waits here must not pick up a task of the caller's, who may hold
         // locks.
-        tbb::this_task_arena::isolate([&] {
-            tbb::parallel_for(tbb::blocked_range<size_t>(0, rayCount, 64),
-                              [&](const tbb::blocked_range<size_t>& range) {
-                                  for (size_t i = range.begin(); i != range.end(); ++i) {
-                                      body(i);
-                                  }
-                              });
-        });
+        tbb::this_task_arena::isolate([&] { parallelFor(rayCount, 64, body); });
     };
     if (query.threads == 0) {
         run();

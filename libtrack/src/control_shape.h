@@ -2,7 +2,7 @@
 // The kinds of control and how each varies inside its super-voxel.
 #pragma once
 
-#include "math.h"
+#include "geometry.h"
 
 #include <algorithm>
 #include <array>

@@ -27,13 +27,29 @@ class Rng {
     /// Uniformly distributed in [0, 1).
     double uniform() { return static_cast<double>(next() >> 11) * 0x1p-53; }
 
-    /// Exponentially distributed with mean 1; from 0 to 23.
-    double exponential() {
-        const auto u = (static_cast<float>(next() >> 32) + 0.5f) * 0x1p-32f;  // (0, 1]
+    /// Exponentially distributed with mean 1. P(X < x) is right to a part in 30,000 for every x
+    /// down to 2^-63, below which only the least value lies, 2^-65; so is P(X > x) up to 44.
+    double exponential() { return exponentialOf(next()); }
+
+    /// -log(1 - v) for v = (bits + 1/2) 2^-64, which grows with `bits`. In float, except where v or
+    /// 1 - v is below 2^-10: next to 1 a float knows no differences below 2^-25, and thin haze
+    /// would scatter where the ray enters it.
+    static double exponentialOf(uint64_t bits) {
+        constexpr uint64_t kRare = uint64_t{1} << 54;
+        if (bits + kRare < 2 * kRare) {
+            return rareExponentialOf(bits);
+        }
+        const auto u = (static_cast<float>(static_cast<uint32_t>(~bits >> 32)) + 0.5f) * 0x1p-32f;
         return static_cast<double>(-std::log(u));
     }
 
   private:
+    static double rareExponentialOf(uint64_t bits) {
+        const bool large = bits >> 63 != 0;
+        const double v = (static_cast<double>(large ? ~bits : bits) + 0.5) * 0x1p-64;
+        return large ? -std::log(v) : -std::log1p(-v);
+    }
+
     static uint64_t mix(uint64_t z) {
         z += 0x9e3779b97f4a7c15u;
         z = (z ^ (z >> 30)) * 0xbf58476d1ce4e5b9u;

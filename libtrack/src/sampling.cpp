@@ -2,8 +2,8 @@
 #include "sampling.h"
 
 #include "batch.h"
-#include "error.h"
 #include "estimators/free_path.h"
+#include "failure.h"
 #include "rng.h"
 #include "variant.h"
 
@@ -17,40 +17,44 @@ namespace trk {
 namespace {
 
 template <class V>
-TrkFreePath sampleOne(const Volume& volume, const TrkQuery& query, const TrkRay& ray,
-                      uint64_t rayId) {
+void sampleOne(const Volume& volume, const TrkQuery& query, const TrkRay& ray, size_t i,
+               const FreePathOutput& out) {
     constexpr size_t C = V::kChannels;
     PathCost cost;
     FreePath<C> path;
     const auto clipped = volume.clip(ray, volume.field->box());
     if (clipped) {
-        const TrackingSettings settings = trackingSettings(query, clipped->lengthPerVoxel);
+        TrackingSettings settings = trackingSettings(query, clipped->lengthPerVoxel);
+        settings.wantsExtinction = static_cast<bool>(out.extinction);
         const typename V::Extinction extinction(volume);
         const typename V::Walk superVoxels{volume.tracked()};
-        Rng rng(query.seed, query.stream, rayId, 0, Purpose::kFreePath);
+        Rng rng(query.seed, query.stream, rayIdAt(query, i), 0, Purpose::kFreePath);
         path = query.method == TRK_METHOD_DELTA
                    ? sampleFreePath<false>(extinction, superVoxels, clipped->local, settings, rng,
                                            cost)
                    : sampleFreePath<true>(extinction, superVoxels, clipped->local, settings, rng,
                                           cost);
     }
-    TrkFreePath result;
-    result.t = std::numeric_limits<float>::infinity();
+    float& t = *out.t.at(i);
+    t = std::numeric_limits<float>::infinity();
     if (path.collided) {
         // Finite, as infinity says that it escapes.
-        const double t = std::min(clipped->tStart + path.t * clipped->tPerVoxel,
-                                  static_cast<double>(std::numeric_limits<float>::max()));
-        result.t = std::min(std::max(static_cast<float>(t), ray.tMin), ray.tMax);
+        const double at = std::min(clipped->tStart + path.t * clipped->tPerVoxel,
+                                   static_cast<double>(std::numeric_limits<float>::max()));
+        t = std::min(std::max(static_cast<float>(at), ray.tMin), ray.tMax);
     }
-    for (size_t c = 0; c < 3; ++c) {
-        result.weight[c] = static_cast<float>(path.weight[C == 1 ? 0 : c]);
-        result.extinction[c] = (query.flags & TRK_QUERY_EXTINCTION) == 0
-                                   ? 0.0f
-                                   : static_cast<float>(path.extinction[C == 1 ? 0 : c]);
+    const auto toFloat = [](double value) { return static_cast<float>(value); };
+    if (out.weight) {
+        std::transform(path.weight.begin(), path.weight.end(), out.weight.at(i), toFloat);
     }
-    result.lookups = static_cast<uint32_t>(
-        std::min<uint64_t>(cost.lookups, std::numeric_limits<uint32_t>::max()));
-    return result;
+    if (out.extinction) {
+        std::transform(path.extinction.begin(), path.extinction.end(), out.extinction.at(i),
+                       toFloat);
+    }
+    if (out.lookups) {
+        *out.lookups.at(i) = static_cast<uint32_t>(
+            std::min<uint64_t>(cost.lookups, std::numeric_limits<uint32_t>::max()));
+    }
 }
 
 bool contains(const IntBox& box, const Vec3d& point) {
@@ -67,27 +71,22 @@ bool contains(const IntBox& box, const Vec3d& point) {
 }  // namespace
 
 void sampleFreePaths(const Volume& volume, const TrkQuery& query, const TrkRay* rays,
-                     size_t rayCount, TrkFreePath* results) {
+                     size_t rayCount, const FreePathOutput& paths) {
     requireDensity(volume);
     requireSuperVoxels(volume);
     checkRays(query, rays, rayCount);
     withVariant(volume, ControlKind::kConstant, [&](auto variant) {
         using V = decltype(variant);
-        forEachRay(query, rayCount, [&](size_t i) {
-            results[i] = sampleOne<V>(volume, query, rayAt(query, rays, i), rayIdAt(query, i));
-        });
+        forEachRay(query, rayCount,
+                   [&](size_t i) { sampleOne<V>(volume, query, rayAt(query, rays, i), i, paths); });
     });
 }
 
-void sampleExtinction(const Volume& volume, const float* points, size_t pointStride,
-                      size_t pointCount, float* extinction) {
+void sampleExtinction(const Volume& volume, const Array<const float>& points, size_t pointCount,
+                      const Array<float>& extinction) {
     requireDensity(volume);
-    const auto pointAt = [&](size_t i) {
-        return reinterpret_cast<const float*>(reinterpret_cast<const unsigned char*>(points) +
-                                              i * pointStride);
-    };
     for (size_t i = 0; i < pointCount; ++i) {
-        const float* p = pointAt(i);
+        const float* p = points.at(i);
         if (!std::isfinite(p[0]) || !std::isfinite(p[1]) || !std::isfinite(p[2])) {
             throw Error(TRK_ERROR_INVALID_ARGUMENT,
                         "point " + std::to_string(i) + ": expected finite coordinates");
@@ -98,7 +97,7 @@ void sampleExtinction(const Volume& volume, const float* points, size_t pointStr
         constexpr size_t C = V::kChannels;
         const typename V::Extinction field(volume);
         for (size_t i = 0; i < pointCount; ++i) {
-            const float* p = pointAt(i);
+            const float* p = points.at(i);
             Vec3d local =
                 volume.worldToIndex.point({{static_cast<double>(p[0]), static_cast<double>(p[1]),
                                             static_cast<double>(p[2])}});
@@ -109,7 +108,7 @@ void sampleExtinction(const Volume& volume, const float* points, size_t pointStr
             if (contains(volume.field->box(), local)) {
                 value = field.extinction(local);
             }
-            std::transform(value.begin(), value.end(), extinction + i * C,
+            std::transform(value.begin(), value.end(), extinction.at(i),
                            [](double v) { return static_cast<float>(v); });
         }
     });

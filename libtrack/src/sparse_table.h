@@ -3,8 +3,8 @@
 // (whose items are bricks of 8^3 voxels) and the super-voxels (items of N^3 voxels) live in one.
 #pragma once
 
+#include "geometry.h"
 #include "hash.h"
-#include "math.h"
 
 #include <array>
 #include <cstdint>

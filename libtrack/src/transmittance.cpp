@@ -2,11 +2,11 @@
 #include "transmittance.h"
 
 #include "batch.h"
-#include "error.h"
 #include "estimators/exact.h"
 #include "estimators/free_path.h"
 #include "estimators/ratio_tracking.h"
 #include "estimators/ray_marching.h"
+#include "failure.h"
 #include "rng.h"
 #include "variant.h"
 
@@ -58,16 +58,19 @@ std::array<double, V::kChannels> deterministicDepth(const Volume& volume, const 
     return depth;
 }
 
-/// Mean and standard error of the estimates of one ray, per channel.
+constexpr double kNaN = std::numeric_limits<double>::quiet_NaN();
+
+/// Mean and standard error of the estimates of one ray, per channel. The error is NaN where it is
+/// not known.
 template <size_t C>
 struct Estimate {
     std::array<double, C> mean;
     std::array<double, C> standardError;
 };
 
-/// Of query.samples estimates, each what `estimateOnce(rng)` answers.
+/// Of query.samples estimates, each what `estimateOnce(rng)` answers; it adds to `cost`.
 template <size_t C, class EstimateOnce>
-Estimate<C> averageSamples(const TrkQuery& query, uint64_t rayId,
+Estimate<C> averageSamples(const TrkQuery& query, uint64_t rayId, const PathCost& cost,
                            const EstimateOnce& estimateOnce) {
     Estimate<C> result{};
     // Sums of squared deviations, updated without cancellation [Welford 1962].
@@ -83,8 +86,10 @@ Estimate<C> averageSamples(const TrkQuery& query, uint64_t rayId,
     }
     const double n = query.samples;
     for (size_t c = 0; c < C; ++c) {
-        result.standardError[c] = query.samples > 1 ? std::sqrt(squares[c] / (n * (n - 1)))
-                                                    : std::numeric_limits<double>::quiet_NaN();
+        // That random estimates agree says little: only a larger number of them would differ.
+        result.standardError[c] = squares[c] > 0 ? std::sqrt(squares[c] / (n * (n - 1)))
+                                  : cost.random  ? kNaN
+                                                 : 0.0;
     }
     return result;
 }
@@ -99,7 +104,7 @@ Estimate<V::kChannels> estimateRandomly(const Volume& volume, const TrkQuery& qu
     const typename V::Extinction extinction(volume);
     const typename V::Walk superVoxels{volume.tracked()};
     const auto average = [&](const auto& estimateOnce) {
-        return averageSamples<C>(query, rayId, estimateOnce);
+        return averageSamples<C>(query, rayId, cost, estimateOnce);
     };
     switch (query.method) {
         case TRK_METHOD_RESIDUAL:
@@ -133,39 +138,49 @@ float toFloat(double value) {
     return static_cast<float>(std::fmin(std::fmax(value, -kLimit), kLimit));
 }
 
+/// As float; what is not 0 stays so.
+float roundedError(double value) {
+    const auto error = static_cast<float>(value);
+    return value > 0 ? std::max(error, std::numeric_limits<float>::denorm_min()) : error;
+}
+
 template <class V>
-void estimateRay(const Volume& volume, const TrkQuery& query, const TrkRay& ray, uint64_t rayId,
-                 float* transmittance, TrkStatistics* statistics) {
+void estimateRay(const Volume& volume, const TrkQuery& query, const TrkRay& ray, size_t i,
+                 const Array<float>& transmittance, const StatisticsOutput& statistics) {
     constexpr size_t C = V::kChannels;
     PathCost cost;
     double clippedLength = 0;
     double samples = 1;
     Estimate<C> estimate;
     estimate.mean.fill(1);
-    estimate.standardError.fill(0);
+    estimate.standardError.fill(0);  // of a ray that misses the volume, whatever the method
     if (query.method == TRK_METHOD_EXACT || query.method == TRK_METHOD_CONTROL) {
         const auto depth = deterministicDepth<V>(volume, query, ray, clippedLength, cost);
         for (size_t c = 0; c < C; ++c) {
             estimate.mean[c] = std::exp(-depth[c]);
         }
-    } else {
-        if (const auto clipped = volume.clip(ray, volume.field->box())) {
-            clippedLength = clipped->local.tEnd;
-            samples = query.samples;
-            estimate = estimateRandomly<V>(volume, query, *clipped, rayId, cost);
-        } else if (query.samples == 1) {
-            estimate.standardError.fill(std::numeric_limits<double>::quiet_NaN());
-        }
+    } else if (const auto clipped = volume.clip(ray, volume.field->box())) {
+        clippedLength = clipped->local.tEnd;
+        samples = query.samples;
+        estimate = estimateRandomly<V>(volume, query, *clipped, rayIdAt(query, i), cost);
     }
-    std::transform(estimate.mean.begin(), estimate.mean.end(), transmittance, toFloat);
-    if (statistics) {
-        *statistics = TrkStatistics{};
-        statistics->lookups = cost.lookups;
-        statistics->superVoxels = cost.superVoxels;
-        for (size_t c = 0; c < C; ++c) {
-            statistics->standardError[c] = static_cast<float>(estimate.standardError[c]);
-        }
-        statistics->exactShare =
+    const bool biased = query.method == TRK_METHOD_CONTROL || query.method == TRK_METHOD_MARCH;
+    if (biased && clippedLength > 0) {
+        estimate.standardError.fill(kNaN);
+    }
+    std::transform(estimate.mean.begin(), estimate.mean.end(), transmittance.at(i), toFloat);
+    if (statistics.standardError) {
+        std::transform(estimate.standardError.begin(), estimate.standardError.end(),
+                       statistics.standardError.at(i), roundedError);
+    }
+    if (statistics.lookups) {
+        *statistics.lookups.at(i) = cost.lookups;
+    }
+    if (statistics.superVoxels) {
+        *statistics.superVoxels.at(i) = cost.superVoxels;
+    }
+    if (statistics.exactShare) {
+        *statistics.exactShare.at(i) =
             clippedLength > 0 ? static_cast<float>(cost.exactLength / (samples * clippedLength))
                               : 0.0f;
     }
@@ -174,7 +189,8 @@ void estimateRay(const Volume& volume, const TrkQuery& query, const TrkRay& ray,
 }  // namespace
 
 void estimateTransmittance(const Volume& volume, const TrkQuery& query, const TrkRay* rays,
-                           size_t rayCount, float* transmittance, TrkStatistics* statistics) {
+                           size_t rayCount, const Array<float>& transmittance,
+                           const StatisticsOutput& statistics) {
     checkMethod(volume, query);
     checkRays(query, rays, rayCount);
     const ControlKind kind = query.method == TRK_METHOD_RESIDUAL  ? volume.tracked().kind()
@@ -183,14 +199,13 @@ void estimateTransmittance(const Volume& volume, const TrkQuery& query, const Tr
     withVariant(volume, kind, [&](auto variant) {
         using V = decltype(variant);
         forEachRay(query, rayCount, [&](size_t i) {
-            estimateRay<V>(volume, query, rayAt(query, rays, i), rayIdAt(query, i),
-                           transmittance + i * V::kChannels, statistics ? statistics + i : nullptr);
+            estimateRay<V>(volume, query, rayAt(query, rays, i), i, transmittance, statistics);
         });
     });
 }
 
 void integrateOpticalDepth(const Volume& volume, const TrkQuery& query, const TrkRay* rays,
-                           size_t rayCount, double* opticalDepth) {
+                           size_t rayCount, const Array<double>& opticalDepth) {
     checkMethod(volume, query);
     checkRays(query, rays, rayCount);
     const ControlKind kind =
@@ -202,7 +217,7 @@ void integrateOpticalDepth(const Volume& volume, const TrkQuery& query, const Tr
             double clippedLength = 0;
             const auto depth =
                 deterministicDepth<V>(volume, query, rayAt(query, rays, i), clippedLength, cost);
-            std::copy(depth.begin(), depth.end(), opticalDepth + i * V::kChannels);
+            std::copy(depth.begin(), depth.end(), opticalDepth.at(i));
         });
     });
 }

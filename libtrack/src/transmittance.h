@@ -2,18 +2,28 @@
 // Batches of rays: method x control over TBB.
 #pragma once
 
+#include "batch.h"
 #include "track/track.h"
 #include "volume.h"
 
 namespace trk {
 
+/// Where a batch puts what it took: arrays that may be none.
+struct StatisticsOutput {
+    Array<float> standardError;
+    Array<uint64_t> lookups;
+    Array<uint64_t> superVoxels;
+    Array<float> exactShare;
+};
+
 /// As trkEstimateTransmittance, with `query` checked and complete. Throws Error before any result
 /// is written.
 void estimateTransmittance(const Volume& volume, const TrkQuery& query, const TrkRay* rays,
-                           size_t rayCount, float* transmittance, TrkStatistics* statistics);
+                           size_t rayCount, const Array<float>& transmittance,
+                           const StatisticsOutput& statistics);
 
 /// As trkIntegrateOpticalDepth, likewise.
 void integrateOpticalDepth(const Volume& volume, const TrkQuery& query, const TrkRay* rays,
-                           size_t rayCount, double* opticalDepth);
+                           size_t rayCount, const Array<double>& opticalDepth);
 
 }  // namespace trk

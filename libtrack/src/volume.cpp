@@ -1,7 +1,7 @@
 // SPDX-License-Identifier: Apache-2.0
 #include "volume.h"
 
-#include "error.h"
+#include "failure.h"
 #include "io/density.h"
 #include "io/sidecar.h"
 
@@ -11,10 +11,6 @@
 #include <limits>
 #include <sstream>
 #include <utility>
-
-#if defined(__GLIBC__)
-#include <malloc.h>
-#endif
 
 namespace trk {
 namespace {
@@ -204,11 +200,6 @@ Volume openVolume(const char* vdbPath, const char* sidecarPath, const VolumeOpti
     if (haveSidecar) {
         addSuperVoxels(volume, std::move(sidecar.baked), options, path);
     }
-#if defined(__GLIBC__)
-    // OpenVDB's trees are millions of small blocks: freed, they would stay with the process, about
-    // as much again as the volume holds.
-    malloc_trim(0);
-#endif
     checkMemory(volume.bytes(), options.maxMemory, vdbPath ? vdbPath : volume.sidecarPath);
     return volume;
 }

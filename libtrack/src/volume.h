@@ -3,7 +3,7 @@
 #pragma once
 
 #include "extinction_field.h"
-#include "math.h"
+#include "geometry.h"
 #include "super_voxels.h"
 
 #include <algorithm>

@@ -63,7 +63,7 @@ std::vector<double> depths(const track::Volume& volume, const vdbtools::Camera& 
             rays.push_back(camera.ray((column + 0.5) / kEdge, (row + 0.5) / kEdge, 1));
         }
     }
-    TrkQuery query = trkDefaultQuery();
+    track::Query query(0, 0);
     query.method = method;
     query.level = level;
     std::vector<double> result(rays.size());

@@ -57,8 +57,8 @@ struct Set {
     std::vector<float> exact;
 };
 
-TrkQuery singleThreaded(TrkMethod method) {
-    TrkQuery query = trkDefaultQuery();
+track::Query singleThreaded(TrkMethod method) {
+    track::Query query(0, 0);
     query.method = method;
     query.threads = 1;
     return query;
@@ -95,7 +95,7 @@ Set& makeSet(const Case& c) {
     const track::Volume unscaled = track::Volume::open(vdb, "", options);
     const rays::Box box = rays::boundsOf(unscaled.info());
     set.rays = c.coherent ? cameraRays(box) : rays::through(box, 16384, 0, 1);
-    const TrkQuery query = singleThreaded(TRK_METHOD_EXACT);
+    const track::Query query = singleThreaded(TRK_METHOD_EXACT);
     const size_t channels = unscaled.info().channels;
     std::vector<double> depths(channels * set.rays.size());
     unscaled.integrateOpticalDepth(query, set.rays.data(), set.rays.size(), depths.data());
@@ -115,22 +115,22 @@ Set& makeSet(const Case& c) {
 
 void estimate(benchmark::State& state, TrkMethod method, const Case& measured) {
     Set& set = makeSet(measured);
-    TrkQuery query = singleThreaded(method);
+    track::Query query = singleThreaded(method);
     std::vector<float> out(set.exact.size());
-    std::vector<TrkStatistics> statistics(set.rays.size());
+    track::Statistics statistics(set.rays.size(), out.size() / set.rays.size());
     double squares = 0;
     double lookups = 0;
     for (auto ignored : state) {
         ++query.seed;
         set.volume->estimateTransmittance(query, set.rays.data(), set.rays.size(), out.data(),
-                                          statistics.data());
+                                          statistics.view());
         state.PauseTiming();
         for (size_t i = 0; i < out.size(); ++i) {
             const double error = static_cast<double>(out[i]) - static_cast<double>(set.exact[i]);
             squares += error * error;
         }
-        for (const TrkStatistics& s : statistics) {
-            lookups += static_cast<double>(s.lookups);
+        for (const uint64_t n : statistics.lookups) {
+            lookups += static_cast<double>(n);
         }
         state.ResumeTiming();
     }
@@ -144,15 +144,15 @@ void estimate(benchmark::State& state, TrkMethod method, const Case& measured) {
 /// Free paths by decomposition or delta tracking; look-ups as counter.
 void samplePaths(benchmark::State& state, TrkMethod method, const Case& measured) {
     Set& set = makeSet(measured);
-    TrkQuery query = singleThreaded(method);
-    std::vector<TrkFreePath> out(set.rays.size());
+    track::Query query = singleThreaded(method);
+    track::FreePaths out(set.rays.size(), set.exact.size() / set.rays.size());
     double lookups = 0;
     for (auto ignored : state) {
         ++query.seed;
-        set.volume->sampleFreePath(query, set.rays.data(), set.rays.size(), out.data());
+        set.volume->sampleFreePath(query, set.rays.data(), set.rays.size(), out.view());
         state.PauseTiming();
-        for (const TrkFreePath& path : out) {
-            lookups += path.lookups;
+        for (const uint32_t n : out.lookups) {
+            lookups += n;
         }
         state.ResumeTiming();
     }

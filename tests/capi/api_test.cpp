@@ -81,7 +81,7 @@ TEST(Api, RefusesAScaleThatOverflows) {
     options.scale = 3e37f;
     EXPECT_EQ(trkOpenVolume(path.c_str(), "", &options, &volume), TRK_OK);
     const TrkRay ray{{-5, 1, 1}, 0, {1, 0, 0}, rays::kInfinity};
-    TrkQuery query = trkDefaultQuery();
+    track::Query query(0, 0);
     query.method = TRK_METHOD_EXACT;
     float transmittance = 1;
     EXPECT_EQ(trkEstimateTransmittance(volume, &query, &ray, 1, &transmittance, nullptr), TRK_OK);
@@ -117,7 +117,7 @@ TEST(Api, RefusesBadQueriesBeforeWritingAnything) {
     std::vector<TrkRay> all = cloudRays(volume, 10);
     std::vector<float> out(10, -7);
     const auto refused = [&](const char* text, const auto& change) {
-        TrkQuery query = trkDefaultQuery();
+        track::Query query(0, 0);
         change(query);
         expectRefused(trkEstimateTransmittance(volume.handle(), &query, all.data(), all.size(),
                                                out.data(), nullptr),
@@ -160,7 +160,8 @@ TEST(Api, RefusesBadQueriesBeforeWritingAnything) {
         trkEstimateTransmittance(volume.handle(), nullptr, all.data(), 1, nullptr, nullptr),
         TRK_ERROR_INVALID_ARGUMENT, "result array is NULL");
     double depth = 0;
-    expectRefused(trkIntegrateOpticalDepth(volume.handle(), nullptr, all.data(), 1, &depth),
+    const track::Query random(0, 0);
+    expectRefused(trkIntegrateOpticalDepth(volume.handle(), &random, all.data(), 1, &depth),
                   TRK_ERROR_INVALID_ARGUMENT, "random");
     EXPECT_EQ(trkEstimateTransmittance(volume.handle(), nullptr, nullptr, 0, nullptr, nullptr),
               TRK_OK);
@@ -171,11 +172,11 @@ TEST(Api, SaysWhichFileAMethodLacks) {
     const track::Volume alone = track::Volume::open("", files().sidecar.c_str());
     const TrkRay ray{{0, 0, 0}, 0, {1, 1, 1}, 100};
     float out = -1;
-    TrkQuery query = trkDefaultQuery();
+    track::Query query(0, 0);
     for (const TrkMethod method : {TRK_METHOD_RESIDUAL, TRK_METHOD_RATIO, TRK_METHOD_CONTROL}) {
         query.method = method;
         expectRefused(trkEstimateTransmittance(bare.handle(), &query, &ray, 1, &out, nullptr),
-                      TRK_ERROR_NO_SIDECAR, "vdbtrack bake");
+                      TRK_ERROR_NO_SIDECAR, "sidecar");
     }
     for (const TrkMethod method : {TRK_METHOD_RESIDUAL, TRK_METHOD_RATIO, TRK_METHOD_EXACT}) {
         query.method = method;
@@ -213,7 +214,7 @@ TEST(Api, EmptyIntervalsAndMissesGiveOne) {
     };
     for (const TrkMethod method :
          {TRK_METHOD_EXACT, TRK_METHOD_RESIDUAL, TRK_METHOD_RATIO, TRK_METHOD_CONTROL}) {
-        TrkQuery query = trkDefaultQuery();
+        track::Query query(0, 0);
         query.method = method;
         std::vector<float> out(all.size());
         volume.estimateTransmittance(query, all.data(), all.size(), out.data());
@@ -225,7 +226,7 @@ TEST(Api, EmptyIntervalsAndMissesGiveOne) {
 
 TEST(Api, IntervalsThatAbutMultiply) {
     const track::Volume volume = openCloud();
-    TrkQuery query = trkDefaultQuery();
+    track::Query query(0, 0);
     query.method = TRK_METHOD_EXACT;
     for (TrkRay ray : cloudRays(volume, 200)) {
         ray.tMin = -rays::kInfinity;
@@ -252,16 +253,16 @@ TEST(Api, SameBitsForSinglesBatchesThreadsAndSplits) {
     const track::Volume volume = openCloud();
     const std::vector<TrkRay> all = cloudRays(volume, 3000);
     for (const TrkMethod method : {TRK_METHOD_EXACT, TRK_METHOD_RESIDUAL, TRK_METHOD_RATIO}) {
-        TrkQuery query = trkDefaultQuery();
+        track::Query query(0, 0);
         query.method = method;
         query.samples = 3;
         query.seed = 5;
         query.stream = 6;
         query.firstRayId = 1000;
         std::vector<float> reference(all.size());
-        std::vector<TrkStatistics> statistics(all.size());
+        track::Statistics statistics(all.size(), 1);
         volume.estimateTransmittance(query, all.data(), all.size(), reference.data(),
-                                     statistics.data());
+                                     statistics.view());
         const auto expectSame = [&](const std::vector<float>& out) {
             EXPECT_EQ(std::memcmp(out.data(), reference.data(), out.size() * sizeof(float)), 0);
         };
@@ -307,7 +308,7 @@ TEST(Api, RaysMayBeStrided) {
     for (const TrkRay& ray : all) {
         payload.push_back({ray, 1});
     }
-    TrkQuery query = trkDefaultQuery();
+    track::Query query(0, 0);
     std::vector<float> dense(all.size());
     std::vector<float> strided(all.size());
     volume.estimateTransmittance(query, all.data(), all.size(), dense.data());
@@ -320,7 +321,7 @@ TEST(Api, SeedAndStreamChangeEstimates) {
     const track::Volume volume = openCloud();
     const std::vector<TrkRay> all = cloudRays(volume, 200);
     const auto estimate = [&](uint64_t seed, uint64_t stream) {
-        TrkQuery query = trkDefaultQuery();
+        track::Query query(0, 0);
         query.method = TRK_METHOD_RATIO;
         query.seed = seed;
         query.stream = stream;
@@ -337,26 +338,28 @@ TEST(Api, StatisticsTellWhatWasSpent) {
     const track::Volume volume = openCloud();
     const std::vector<TrkRay> all = cloudRays(volume, 500);
     std::vector<float> out(all.size());
-    std::vector<TrkStatistics> statistics(all.size());
-    TrkQuery query = trkDefaultQuery();
+    track::Statistics statistics(all.size(), 1);
+    track::Query query(0, 0);
     query.method = TRK_METHOD_EXACT;
-    volume.estimateTransmittance(query, all.data(), all.size(), out.data(), statistics.data());
+    volume.estimateTransmittance(query, all.data(), all.size(), out.data(), statistics.view());
     for (size_t i = 0; i < all.size(); ++i) {
-        EXPECT_EQ(statistics[i].standardError[0], 0);
-        if (statistics[i].lookups > 0) {
-            EXPECT_EQ(statistics[i].exactShare, 1.0f);
+        EXPECT_EQ(statistics.standardError[i], 0);
+        if (statistics.lookups[i] > 0) {
+            EXPECT_EQ(statistics.exactShare[i], 1.0f);
         }
     }
     query.method = TRK_METHOD_RATIO;
-    volume.estimateTransmittance(query, all.data(), all.size(), out.data(), statistics.data());
-    EXPECT_TRUE(std::isnan(statistics[0].standardError[0]));
+    volume.estimateTransmittance(query, all.data(), all.size(), out.data(), statistics.view());
+    EXPECT_TRUE(std::all_of(statistics.standardError.begin(), statistics.standardError.end(),
+                            [](float e) { return std::isnan(e) || e == 0; }));
     query.samples = 64;
-    volume.estimateTransmittance(query, all.data(), all.size(), out.data(), statistics.data());
+    volume.estimateTransmittance(query, all.data(), all.size(), out.data(), statistics.view());
     uint64_t lookups = 0;
     double error = 0;
-    for (const TrkStatistics& s : statistics) {
-        lookups += s.lookups;
-        error += static_cast<double>(s.standardError[0]);
+    for (size_t i = 0; i < all.size(); ++i) {
+        lookups += statistics.lookups[i];
+        const float e = statistics.standardError[i];
+        error += std::isnan(e) ? 0 : static_cast<double>(e);
     }
     EXPECT_GT(lookups, all.size());
     EXPECT_GT(error, 0);
@@ -365,7 +368,7 @@ TEST(Api, StatisticsTellWhatWasSpent) {
 TEST(Api, ConcurrentQueriesAgree) {
     const track::Volume volume = openCloud();
     const std::vector<TrkRay> all = cloudRays(volume, 2000);
-    const TrkQuery query = trkDefaultQuery();
+    const track::Query query(0, 0);
     std::vector<float> reference(all.size());
     volume.estimateTransmittance(query, all.data(), all.size(), reference.data());
     std::vector<std::vector<float>> results(4, std::vector<float>(all.size()));
@@ -373,7 +376,7 @@ TEST(Api, ConcurrentQueriesAgree) {
     for (auto& result : results) {
         threads.emplace_back([&] {
             for (size_t i = 0; i < all.size(); ++i) {
-                TrkQuery one = query;
+                track::Query one = query;
                 one.firstRayId = i;
                 volume.estimateTransmittance(one, &all[i], 1, &result[i]);
             }
@@ -391,7 +394,7 @@ TEST(Api, AnyNumberOfThreadsIsAllowed) {
     TrkVolumeOptions options = trkDefaultVolumeOptions();
     options.threads = 1000000;
     const track::Volume volume = track::Volume::open(files().vdb, "", options);
-    TrkQuery query = trkDefaultQuery();
+    track::Query query(0, 0);
     query.method = TRK_METHOD_EXACT;
     query.threads = 1000000;
     const std::vector<TrkRay> all = cloudRays(volume, 100);
@@ -418,16 +421,16 @@ TEST(Api, ExtremeScalesStayFinite) {
         const std::vector<TrkRay> all = cloudRays(volume, 200);
         for (const TrkMethod method :
              {TRK_METHOD_EXACT, TRK_METHOD_RESIDUAL, TRK_METHOD_RATIO, TRK_METHOD_CONTROL}) {
-            TrkQuery query = trkDefaultQuery();
+            track::Query query(0, 0);
             query.method = method;
             query.samples = 2;
             std::vector<float> out(all.size());
-            std::vector<TrkStatistics> statistics(all.size());
+            track::Statistics statistics(all.size(), 1);
             volume.estimateTransmittance(query, all.data(), all.size(), out.data(),
-                                         statistics.data());
+                                         statistics.view());
             for (size_t i = 0; i < all.size(); ++i) {
                 ASSERT_TRUE(std::isfinite(out[i])) << scale << " " << method;
-                ASSERT_LT(statistics[i].lookups, 10000u);  // the fallback bounds the cost
+                ASSERT_LT(statistics.lookups[i], 10000u);  // the fallback bounds the cost
                 if (scale == 0.0f) {
                     ASSERT_EQ(out[i], 1.0f);
                 }

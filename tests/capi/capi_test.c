@@ -21,10 +21,13 @@ int main(int argc, char** argv) {
     TrkVolume* volume = NULL;
     TrkVolumeInfo info;
     TrkRay ray = {{0.0f, 0.0f, 0.0f}, 0.0f, {1.0f, 0.0f, 0.0f}, INFINITY};
-    TrkStatistics statistics;
+    TrkStatistics statistics = trkDefaultStatistics();
+    TrkFreePaths paths = trkDefaultFreePaths();
     float transmittance = -1.0f;
+    float standardError = -1.0f;
     float extinction = -1.0f;
-    TrkFreePath path;
+    float t = -1.0f;
+    float weight = -1.0f;
     double depth = -1.0;
     int a;
 
@@ -51,21 +54,25 @@ int main(int argc, char** argv) {
     }
     ray.tMin = -INFINITY;
     query.samples = 64;
+    statistics.standardError = &standardError;
     expect(trkEstimateTransmittance(volume, &query, &ray, 1, &transmittance, &statistics) == TRK_OK,
            "trkEstimateTransmittance");
     query.method = TRK_METHOD_EXACT;
     expect(trkIntegrateOpticalDepth(volume, &query, &ray, 1, &depth) == TRK_OK,
            "trkIntegrateOpticalDepth");
-    expect(
-        depth > 0.0 && fabs(exp(-depth) - transmittance) < 6 * statistics.standardError[0] + 1e-6,
-        "the estimate is near the exact value");
+    expect(depth > 0.0 && fabs(exp(-depth) - transmittance) < 6 * standardError + 1e-6,
+           "the estimate is near the exact value");
     query = trkDefaultQuery();
-    expect(trkSampleFreePath(volume, &query, &ray, 1, &path) == TRK_OK, "trkSampleFreePath");
-    expect(path.weight[0] == 1.0f && path.weight[2] == 1.0f, "a grey volume's weights are 1");
-    expect(isinf(path.t) ? path.extinction[0] == 0.0f : path.extinction[0] > 0.0f,
-           "extinction where it collides");
-    expect(trkSampleExtinction(volume, ray.origin, 0, 1, &extinction) == TRK_OK && extinction > 0,
-           "trkSampleExtinction");
+    paths.t = &t;
+    paths.weight = &weight;
+    paths.extinction = &extinction;
+    expect(trkSampleFreePath(volume, &query, &ray, 1, &paths) == TRK_OK, "trkSampleFreePath");
+    expect(weight == 1.0f, "a grey volume's weight is 1");
+    expect(isinf(t) ? extinction == 0.0f : extinction > 0.0f, "extinction where it collides");
+    extinction = -1.0f;
+    expect(
+        trkSampleExtinction(volume, ray.origin, 0, 1, &extinction, 0) == TRK_OK && extinction > 0,
+        "trkSampleExtinction");
     trkCloseVolume(volume);
     trkCloseVolume(NULL);
 

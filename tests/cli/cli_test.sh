@@ -464,6 +464,27 @@ case_signals() {
     wait $pid || fail "a program started by nohup ended on SIGHUP"
 }
 
+# Where no thread can be started, --threads 1 needs none. (OpenVDB's logging library starts its own when
+# the program is loaded: the limit is the least at which that succeeds.)
+case_no_threads() {
+    [ "$(id -u)" = 0 ] || exit 77  # for a user of their own, without other processes
+    small_cloud
+    local user=54321
+    chmod 755 "$work"
+    limited() { setpriv --reuid=$user --regid=$user --clear-groups prlimit --nproc="$limit" "$vdbtrack" "$@"; }
+    limit=1
+    until limited --version >/dev/null 2>&1; do
+        limit=$((limit + 1))
+        [ $limit -lt 64 ] || exit 77
+    done
+    chown -R $user "$work"
+    for command in "bake cloud.vdb --size 8" "verify cloud.vdb" "info cloud.vdb" "preview cloud.track.vdb"; do
+        # shellcheck disable=SC2086
+        limited $command --threads 1 >stdout 2>stderr || fail "$command with $limit threads: exit $?, $(cat stderr)"
+    done
+    exists cloud.track.vdb
+}
+
 case_two_bakes_at_once() {
     small_cloud
     for i in 1 2 3 4; do

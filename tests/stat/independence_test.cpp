@@ -59,7 +59,7 @@ constexpr size_t kCount = fixtures::kSanitized ? 40000 : 400000;
 std::vector<float> estimate(const track::Volume& volume, const TrkRay& ray, TrkMethod method,
                             uint64_t stream) {
     const std::vector<TrkRay> rays(kCount, ray);
-    TrkQuery query = trkDefaultQuery();
+    track::Query query(0, 0);
     query.method = method;
     query.stream = stream;
     std::vector<float> result(kCount);
@@ -68,7 +68,7 @@ std::vector<float> estimate(const track::Volume& volume, const TrkRay& ray, TrkM
 }
 
 double exact(const track::Volume& volume, const TrkRay& ray) {
-    TrkQuery query = trkDefaultQuery();
+    track::Query query(0, 0);
     query.method = TRK_METHOD_EXACT;
     double depth = 0;
     volume.integrateOpticalDepth(query, &ray, 1, &depth);
@@ -162,14 +162,14 @@ TEST(Independence, OfFreePathsAndTransmittanceEvenInOneStream) {
     ray.tMax = 1;
     const auto escapes = [&](uint64_t stream) {
         const std::vector<TrkRay> rays(kCount, ray);
-        TrkQuery query = trkDefaultQuery();
+        track::Query query(0, 0);
         query.method = TRK_METHOD_DELTA;
         query.stream = stream;
-        std::vector<TrkFreePath> paths(kCount);
-        volume.sampleFreePath(query, rays.data(), kCount, paths.data());
+        track::FreePaths paths(kCount, 1);
+        volume.sampleFreePath(query, rays.data(), kCount, paths.view());
         std::vector<float> result(kCount);
         for (size_t i = 0; i < kCount; ++i) {
-            result[i] = std::isinf(paths[i].t) ? 1.0f : 0.0f;
+            result[i] = std::isinf(paths.t[i]) ? 1.0f : 0.0f;
         }
         return result;
     };
@@ -180,6 +180,58 @@ TEST(Independence, OfFreePathsAndTransmittanceEvenInOneStream) {
     // And of itself, which is no news, the test would say no.
     const std::vector<float> once = escapes(1);
     EXPECT_GT(productOf(once, once, T, T).z, 10);
+}
+
+// Volumes that overlap: the nearest of their paths is a path of all together, its weight the
+// product of theirs.
+TEST(Independence, TheNearestOfFreePathsIsOneOfBothVolumes) {
+    const std::string vdb = fixtures::cloudFile(64, "color-cloud");
+    const std::string sidecar = fixtures::path("overlap.track.vdb");
+    fixtures::bake(vdb, sidecar, 16);
+    TrkVolumeOptions options = trkDefaultVolumeOptions();
+    options.scale = 0.5f;
+    const track::Volume first = track::Volume::open(vdb, sidecar.c_str(), options);
+    options.scale = 0.8f;
+    options.color[2] = 0.2f;
+    const track::Volume second = track::Volume::open(vdb, sidecar.c_str(), options);
+    const TrkVolumeInfo info = first.info();
+    TrkRay ray{{}, 0, {1, 0.3f, 0.2f}, rays::kInfinity};
+    for (int a = 0; a < 3; ++a) {
+        ray.origin[a] = static_cast<float>(0.5 * (info.boundsMin[a] + info.boundsMax[a]));
+    }
+    const std::vector<TrkRay> rays(kCount, ray);
+    track::FreePaths a(kCount, 3);
+    track::FreePaths b(kCount, 3);
+    first.sampleFreePath({0, 1}, rays.data(), kCount, a.view());
+    second.sampleFreePath({0, 2}, rays.data(), kCount, b.view());
+    const float middle = 0.5f * static_cast<float>(info.boundsMax[0] - info.boundsMin[0]) * 0.3f;
+    TrkRay half = ray;
+    half.tMax = middle;
+    track::Query query(0, 0);
+    query.method = TRK_METHOD_EXACT;
+    float Ta[3];
+    float Tb[3];
+    first.estimateTransmittance(query, &half, 1, Ta);
+    second.estimateTransmittance(query, &half, 1, Tb);
+    for (size_t c = 0; c < 3; ++c) {
+        double sum = 0;
+        double squares = 0;
+        double ofOneStream = 0;
+        for (size_t i = 0; i < kCount; ++i) {
+            const double weight =
+                static_cast<double>(a.weight[3 * i + c]) * static_cast<double>(b.weight[3 * i + c]);
+            const double x = std::min(a.t[i], b.t[i]) > middle ? weight : 0.0;
+            sum += x;
+            squares += x * x;
+            ofOneStream += a.t[i] > middle ? std::pow(static_cast<double>(a.weight[3 * i + c]), 2)
+                                           : 0.0;  // two volumes alike, one stream
+        }
+        const auto n = static_cast<double>(kCount);
+        const double expected = static_cast<double>(Ta[c]) * static_cast<double>(Tb[c]);
+        const double error = std::sqrt((squares / n - sum / n * sum / n) / n);
+        EXPECT_LT(std::fabs(sum / n - expected), 4 * error) << c;
+        EXPECT_GT(std::fabs(ofOneStream / n - static_cast<double>(Ta[c]) * Ta[c]), 8 * error) << c;
+    }
 }
 
 }  // namespace

@@ -1,7 +1,7 @@
 // SPDX-License-Identifier: Apache-2.0
 // Densities of three channels: loading, baking, sidecars, proofs.
 #include "bake.h"
-#include "error.h"
+#include "failure.h"
 #include "io/sidecar.h"
 #include "support/fixtures.h"
 #include "verify.h"

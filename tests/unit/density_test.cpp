@@ -2,7 +2,7 @@
 // Loading: which grid, which refusals, which values.
 #include "support/fixtures.h"
 
-#include "error.h"
+#include "failure.h"
 #include "io/vdb_file.h"
 
 #include <gtest/gtest.h>

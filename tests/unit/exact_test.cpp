@@ -41,7 +41,7 @@ void expectExactAgrees(const std::string& path, size_t count) {
           rays::interior(box, count, 3), rays::through(box, count, 1e5 * voxel, 4)}) {
         all.insert(all.end(), set.begin(), set.end());
     }
-    TrkQuery query = trkDefaultQuery();
+    track::Query query(0, 0);
     query.method = TRK_METHOD_EXACT;
     std::vector<double> depth(all.size());
     volume.integrateOpticalDepth(query, all.data(), all.size(), depth.data());
@@ -122,7 +122,7 @@ TEST(Exact, IndexOffsetsAndFarTranslationsKeepPrecision) {
     far->transform().preTranslate(-offset.asVec3d());
     const track::Volume away = track::Volume::open(fixtures::write("away.vdb", {far}), "");
     const auto all = rays::through(rays::boundsOf(near.info()), 200, 50, 9);
-    TrkQuery query = trkDefaultQuery();
+    track::Query query(0, 0);
     query.method = TRK_METHOD_EXACT;
     std::vector<double> a(all.size());
     std::vector<double> b(all.size());
@@ -140,15 +140,15 @@ TEST(Exact, AConstantTileCostsNothingAndIsExact) {
     grid->tree().addTile(3, openvdb::Coord(0, 0, 0), 0.25f, true);  // 4096^3
     const track::Volume volume = track::Volume::open(fixtures::write("tile.vdb", {grid}), "");
     const TrkRay ray{{-100, 1000.5f, 2000.25f}, 0, {1, 0, 0}, rays::kInfinity};
-    TrkQuery query = trkDefaultQuery();
+    track::Query query(0, 0);
     query.method = TRK_METHOD_EXACT;
     double depth = 0;
     volume.integrateOpticalDepth(query, &ray, 1, &depth);
     EXPECT_NEAR(depth, 0.25 * 4096, 1e-9);  // two ramps of half a voxel make up for the ends
     float transmittance = 0;
-    TrkStatistics statistics;
-    volume.estimateTransmittance(query, &ray, 1, &transmittance, &statistics);
-    EXPECT_LE(statistics.lookups, 40u);  // the two ramps alone
+    track::Statistics statistics(1, 1);
+    volume.estimateTransmittance(query, &ray, 1, &transmittance, statistics.view());
+    EXPECT_LE(statistics.lookups[0], 40u);  // the two ramps alone
 }
 
 }  // namespace

@@ -2,7 +2,7 @@
 // The small pieces of arithmetic: scaled products, halfs, random numbers, the robust control, maps.
 #include "estimators/scaled_product.h"
 #include "extinction_field.h"
-#include "math.h"
+#include "geometry.h"
 #include "rng.h"
 #include "super_voxels.h"
 
@@ -64,14 +64,60 @@ TEST(Rng, ExponentialHasMeanAndVarianceOne) {
     double squares = 0;
     for (int i = 0; i < kCount; ++i) {
         const double x = rng.exponential();
-        ASSERT_GE(x, 0);
-        ASSERT_LT(x, 24);
+        ASSERT_GT(x, 0);
+        ASSERT_LT(x, 46);
         sum += x;
         squares += x * x;
     }
     const double n = kCount;
     EXPECT_NEAR(sum / n, 1, 5 / std::sqrt(n));                        // its variance is 1
     EXPECT_NEAR(squares / n, 2, 5 * std::sqrt(20.0) / std::sqrt(n));  // E[x^4] - 4 = 20
+}
+
+/// P(X < x), counted: how many of the 2^64 words the map, which grows, sends below x.
+double countedBelow(double x, double (*map)(uint64_t)) {
+    uint64_t lo = 0;  // words below it go below x
+    uint64_t hi = ~uint64_t{0};
+    while (lo < hi) {
+        const uint64_t middle = lo + (hi - lo) / 2;
+        if (map(middle) < x) {
+            lo = middle + 1;
+        } else {
+            hi = middle;
+        }
+    }
+    return static_cast<double>(lo) * 0x1p-64;
+}
+
+TEST(Rng, ExponentialHasTheRightProbabilityAtEveryScale) {
+    for (double x = 1e-18; x < 40; x *= 1.7) {
+        const double found = countedBelow(x, trk::Rng::exponentialOf);
+        const double below = -std::expm1(-x);
+        EXPECT_NEAR(found, below, 4e-5 * below + 0x1p-64) << x;
+        const double above = std::exp(-x);
+        if (x > 1 && x < 30) {
+            EXPECT_NEAR(1 - found, above, 4e-5 * above + 0x1p-53) << x;
+        }
+    }
+    EXPECT_EQ(trk::Rng::exponentialOf(0), 0x1p-65);
+    EXPECT_GT(trk::Rng::exponentialOf(~uint64_t{0}), 44);
+    // What the test is for: a number made of a float next to 1.
+    const auto rounded = [](uint64_t bits) {
+        const auto u = (static_cast<float>(~bits >> 32) + 0.5f) * 0x1p-32f;
+        return static_cast<double>(-std::log(u));
+    };
+    EXPECT_GT(countedBelow(1e-8, rounded), 2.5e-8);
+}
+
+TEST(Rng, ExponentialNeverFallsWhereItsTwoHalvesMeet) {
+    for (const uint64_t seam : {uint64_t{1} << 54, ~uint64_t{0} - (uint64_t{1} << 54)}) {
+        double last = 0;
+        for (uint64_t bits = seam - 20000; bits < seam + 20000; ++bits) {
+            const double x = trk::Rng::exponentialOf(bits);
+            ASSERT_GE(x, last * (1 - 1e-7));  // a float's rounding
+            last = x;
+        }
+    }
 }
 
 TEST(Rng, EveryPartOfItsNameMatters) {

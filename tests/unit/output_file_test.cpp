@@ -1,7 +1,7 @@
 // SPDX-License-Identifier: Apache-2.0
 #include "io/output_file.h"
 
-#include "error.h"
+#include "failure.h"
 #include "support/fixtures.h"
 
 #include <gtest/gtest.h>
@@ -36,6 +36,29 @@ TEST(OutputFile, AppearsOnlyWhenCommitted) {
     }
     EXPECT_EQ(get(target), "text");
     EXPECT_EQ(filesBeside(target), before + 1);
+}
+
+size_t openDescriptors() {
+    const std::filesystem::directory_iterator folder("/proc/self/fd");
+    return static_cast<size_t>(std::distance(begin(folder), end(folder)));
+}
+
+TEST(OutputFile, AConstructorThatThrowsLeavesNothing) {
+    const std::string target = fixtures::path("taken.txt");
+    const std::string link = fixtures::path("dangling.txt");
+    put(target, "old");
+    std::filesystem::remove(link);
+    std::filesystem::create_symlink("nowhere.txt", link);
+    const size_t files = filesBeside(target);
+    const size_t descriptors = openDescriptors();
+    EXPECT_THROW(trk::OutputFile(target, false), trk::Error);
+    EXPECT_THROW(trk::OutputFile(link, true), trk::Error);
+    EXPECT_THROW(trk::OutputFile("/proc/self/status", true), trk::Error);
+    EXPECT_THROW(trk::OutputFile("/proc/1/none", true), trk::Error);
+    EXPECT_EQ(openDescriptors(), descriptors);
+    EXPECT_EQ(filesBeside(target), files);
+    EXPECT_TRUE(std::filesystem::is_symlink(link));
+    EXPECT_FALSE(std::filesystem::exists(fixtures::path("nowhere.txt")));
 }
 
 TEST(OutputFile, LeavesNothingWithoutCommit) {

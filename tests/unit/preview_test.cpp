@@ -1,6 +1,6 @@
 // SPDX-License-Identifier: Apache-2.0
 // Lit previews: what their layers mean, and that they come nearer as super-voxels shrink.
-#include "error.h"
+#include "failure.h"
 #include "lit_preview.h"
 #include "support/fixtures.h"
 #include "track/track.h"
@@ -45,7 +45,8 @@ std::vector<float> transmittanceOf(const trk::Volume& volume, const vdbtools::Ca
     query.method = method;
     query.rayStride = sizeof(TrkRay);
     std::vector<float> result(rays.size() * volume.channels());
-    trk::estimateTransmittance(volume, query, rays.data(), rays.size(), result.data(), nullptr);
+    trk::estimateTransmittance(volume, query, rays.data(), rays.size(),
+                               {result.data(), volume.channels(), 0}, {});
     return result;
 }
 

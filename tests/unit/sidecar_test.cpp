@@ -3,7 +3,7 @@
 #include "io/sidecar.h"
 
 #include "bake.h"
-#include "error.h"
+#include "failure.h"
 #include "io/vdb_file.h"
 #include "support/fixtures.h"
 #include "verify.h"

@@ -38,7 +38,7 @@ long peakOf(const std::string& vdb, const std::vector<TrkRay>& all, double& mean
     fixtures::bake(vdb, sidecar, 16, 4);
     const track::Volume volume = track::Volume::open(vdb, sidecar.c_str());
     std::vector<float> transmittance(all.size());
-    TrkQuery query = trkDefaultQuery();
+    track::Query query(0, 0);
     query.flags = TRK_QUERY_EXACT_FALLBACK;  // transmittances are below what roulette leaves
     volume.estimateTransmittance(query, all.data(), all.size(), transmittance.data());
     meanTransmittance = 0;
@@ -75,11 +75,11 @@ TEST(SparseVolumes, TwoPuffsFarApart) {
         EXPECT_LT(peak, 64 * 1024);
     }
     const track::Volume volume = track::Volume::open(vdb, (vdb + ".track.vdb").c_str());
-    TrkQuery query = trkDefaultQuery();
+    track::Query query(0, 0);
     float transmittance = 0;
-    TrkStatistics statistics;
-    volume.estimateTransmittance(query, all.data(), 1, &transmittance, &statistics);
-    EXPECT_LT(statistics.superVoxels, 20u);
+    track::Statistics statistics(1, 1);
+    volume.estimateTransmittance(query, all.data(), 1, &transmittance, statistics.view());
+    EXPECT_LT(statistics.superVoxels[0], 20u);
 }
 
 TEST(SparseVolumes, AHugeConstantTile) {

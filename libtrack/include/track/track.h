@@ -25,6 +25,11 @@ extern "C" {
 
 /* ---- Version --------------------------------------------------------------------------------- */
 
+/** Version of this header. */
+#define TRK_VERSION_MAJOR 0
+#define TRK_VERSION_MINOR 1
+#define TRK_VERSION_PATCH 0
+
 /** Version of the library at run time, "major.minor.patch". Static storage. */
 TRK_API const char* trkGetVersion(void);
 
@@ -55,6 +60,11 @@ TRK_API const char* trkGetStatusName(TrkStatus status);
 TRK_API const char* trkGetLastErrorMessage(void);
 
 /* ---- Types ----------------------------------------------------------------------------------- */
+
+/* Every struct but TrkRay begins with its size as the caller's header knows it; the trkDefault…
+ * functions set it. A newer library completes an older, smaller struct with 0, which is the default
+ * of every field added after the first release. An older library takes a newer, larger struct where
+ * all that it does not know is 0, and refuses it otherwise. TrkRay stays as it is. */
 
 /** An opened, immutable volume. Any number of threads may query one; only closing it must not run
  *  beside other calls on it. */
@@ -92,10 +102,11 @@ enum {
     TRK_CHOICE_MEAN = 1, /**< the mean: least variance where super-voxels are thin */
     TRK_CHOICE_MIN = 2,  /**< the minimum: at rate 1 on the majorant and without roulette, no
                               estimate is above the control's transmittance */
-    TRK_CHOICE_MAX = 3   /**< the maximum */
+    TRK_CHOICE_MAX = 3   /**< the maximum. Experimental: there to compare with */
 };
 
-/** What the sampling rate of residual and ratio tracking is a multiple of, per super-voxel. */
+/** What the sampling rate of residual and ratio tracking is a multiple of, per super-voxel.
+ *  Experimental: there to compare with, and may change before 1.0. */
 typedef int32_t TrkRateBase;
 enum {
     TRK_RATE_BASE_MAJORANT = 0, /**< a bound of |residual|: at rate 1 weights stay within 0 and 2 */
@@ -126,8 +137,8 @@ typedef struct TrkVolumeOptions {
                              agree; a channel of 0 has a transmittance of exactly 1 */
     TrkChoice choice;   /**< control of TRK_METHOD_RESIDUAL */
     uint32_t global;    /**< 1: random methods take the whole volume for one super-voxel, with a
-                             constant control and bounds of its own, whatever was baked: for
-                             comparison; 0: the super-voxels as baked */
+                             constant control and bounds of its own, whatever was baked; 0: the
+                             super-voxels as baked. Experimental: there to compare with */
     TrkCheck check;     /**< how far to distrust the sidecar */
     uint32_t repair;    /**< TRK_REPAIR_… bits; those the sidecar was baked with are added */
     uint64_t maxMemory; /**< refuse to hold more bytes than this; 0: no limit */
@@ -158,24 +169,27 @@ enum {
     /** End a walk early, without bias, where its product of weights is clearly below 1/16 (below
         1/32, always): with probability product x 16 it goes on, and counts for 1/16. On by
         default. */
-    TRK_QUERY_ROULETTE = 2,
-    /** Fill TrkFreePath.extinction. On by default; without, decomposition tracking saves the
-     * look-up where the control collided. */
-    TRK_QUERY_EXTINCTION = 4
+    TRK_QUERY_ROULETTE = 2
 };
 
-/** What to ask. Fill it with trkDefaultQuery(), then change what you need. A result depends on the
- *  ray, its id, and the fields below but `threads` and `rayStride`: the same bits for single rays
- * and batches, any threads, any split. Give different streams to different volumes or path segments
- * that share ray ids: their estimates are then independent and may be multiplied. */
+/** What to ask. Fill it with trkDefaultQuery(), then change what you need.
+ *
+ *  Random numbers follow from (seed, stream, ray id, sample) and nothing else: a result has the
+ * same bits for single rays and batches, any number of threads, any split or order. So a call that
+ *  repeats all four repeats its answer. Give every ray of a picture an id of its own, the same in
+ *  every call about it (pixel x samples per pixel + sample), and every use of that ray's random
+ *  numbers a stream of its own: each bounce, each light, each of several volumes. Estimates of
+ *  different ids or streams are independent and may be multiplied; those of one id and stream agree
+ *  with each other far too well. */
 typedef struct TrkQuery {
     size_t size;          /**< sizeof(TrkQuery) */
-    TrkMethod method;     /**< default TRK_METHOD_RESIDUAL */
+    TrkMethod method;     /**< default TRK_METHOD_RESIDUAL; of trkIntegrateOpticalDepth, where the
+                               query is NULL, TRK_METHOD_EXACT */
     uint32_t samples;     /**< estimates averaged per ray, >= 1; methods without noise ignore it */
     float rate;           /**< multiplies the sampling rate: more look-ups, less variance. > 0; any
                                is unbiased. Of delta and free paths it multiplies the majorant, and
                                must be >= 1 */
-    TrkRateBase rateBase; /**< of residual and ratio */
+    TrkRateBase rateBase; /**< of residual and ratio. Experimental */
     float step;           /**< of TRK_METHOD_MARCH: voxel lengths between look-ups; >= 0.001 */
     uint32_t level;       /**< of TRK_METHOD_CONTROL: 0 the baked super-voxels, k 2^k larger ones */
     uint32_t flags;       /**< TRK_QUERY_… bits */
@@ -184,6 +198,8 @@ typedef struct TrkQuery {
     uint64_t firstRayId;  /**< ray i has id firstRayId + i, unless rayIds is given */
     const uint64_t* rayIds; /**< one id a ray, or NULL */
     size_t rayStride;       /**< bytes from one TrkRay to the next; 0: sizeof(TrkRay) */
+    size_t resultStride;    /**< bytes from one ray's transmittance or optical depth to the next
+                                 ray's; 0: those of its channels */
     int32_t threads;        /**< 0: all, 1: the calling thread alone, n: at most n */
 } TrkQuery;
 
@@ -196,30 +212,93 @@ static inline TrkQuery trkDefaultQuery(void) {
     query.rateBase = TRK_RATE_BASE_MAJORANT;
     query.step = 1.0f;
     query.level = 0;
-    query.flags = TRK_QUERY_EXACT_FALLBACK | TRK_QUERY_ROULETTE | TRK_QUERY_EXTINCTION;
+    query.flags = (uint32_t)TRK_QUERY_EXACT_FALLBACK | (uint32_t)TRK_QUERY_ROULETTE;
     query.seed = 0;
     query.stream = 0;
     query.firstRayId = 0;
     query.rayIds = NULL;
     query.rayStride = 0;
+    query.resultStride = 0;
     query.threads = 0;
     return query;
 }
 
-/** What answering one ray took. */
+/** What answering each ray took, where you want to know: every member is an array of yours with one
+ *  entry a ray, or NULL. Strides are bytes from one ray's entry to the next; 0: without gaps. Fill
+ * it with trkDefaultStatistics(), then point at what you want. */
 typedef struct TrkStatistics {
-    uint64_t lookups;       /**< density values interpolated, over all samples */
-    uint64_t superVoxels;   /**< occupied regions met, all samples: super-voxels, or for the exact
-                                 method bricks; equal neighbours may count as one; delta
-                                 tracking in colour walks, and counts, once a channel */
-    float standardError[3]; /**< of the mean, per channel; 0 for methods without noise, NaN for one
-                                 sample of a random one */
-    float exactShare;       /**< part of the clipped length that was integrated exactly, 0 to 1 */
+    size_t size;          /**< sizeof(TrkStatistics) */
+    float* standardError; /**< of the mean, `channels` floats a ray. 0 where the result is known
+                               exactly: by the exact method, or where a random one found nothing to
+                               be random about. NaN where it is not known: of biased methods, of
+                               one sample, and where all samples agree by chance */
+    size_t standardErrorStride;
+    uint64_t* lookups; /**< density values interpolated, over all samples */
+    size_t lookupsStride;
+    uint64_t* superVoxels; /**< occupied regions met, all samples: super-voxels, or for the exact
+                                method bricks; equal neighbours may count as one; delta tracking in
+                                colour walks, and counts, once a channel */
+    size_t superVoxelsStride;
+    float* exactShare; /**< part of the clipped length that was integrated exactly, 0 to 1 */
+    size_t exactShareStride;
 } TrkStatistics;
+
+static inline TrkStatistics trkDefaultStatistics(void) {
+    TrkStatistics statistics;
+    statistics.size = sizeof(TrkStatistics);
+    statistics.standardError = NULL;
+    statistics.standardErrorStride = 0;
+    statistics.lookups = NULL;
+    statistics.lookupsStride = 0;
+    statistics.superVoxels = NULL;
+    statistics.superVoxelsStride = 0;
+    statistics.exactShare = NULL;
+    statistics.exactShareStride = 0;
+    return statistics;
+}
+
+/** Random free paths: every member is an array of yours with one entry a ray, or NULL where you do
+ *  not want it. Strides are bytes from one ray's entry to the next; 0: without gaps. Fill it with
+ *  trkDefaultFreePaths(), then point at what you want.
+ *
+ *  For channel k with extinction mu_k and transmittance T_k along the ray, and any function f of t:
+ *  E[weight[k] f(t), where t is finite] is the integral of T_k mu_k f over the ray, and
+ * E[weight[k], where t is infinite] is the T_k of the whole ray. So a path tracer multiplies its
+ * throughput by weight x albedo where the path collides, by weight where it escapes. Where
+ *  volumes overlap, the nearest of their paths, if each was given a stream of its own, is one of
+ * all together; its weight is the product of all their weights. */
+typedef struct TrkFreePaths {
+    size_t size; /**< sizeof(TrkFreePaths) */
+    float* t;    /**< where it collides, in the ray's own parameter; +infinity: it escapes */
+    size_t tStride;
+    float* weight; /**< `channels` floats a ray; 1 in a grey volume. Of three, they sum to 3, so
+                      that none is larger, and are not negative */
+    size_t weightStride;
+    float* extinction; /**< where it collides, in 1/world unit, `channels` floats a ray; 0 where it
+                            escapes. Where NULL, decomposition tracking saves the look-up of
+                            collisions with the control */
+    size_t extinctionStride;
+    uint32_t* lookups; /**< density values interpolated */
+    size_t lookupsStride;
+} TrkFreePaths;
+
+static inline TrkFreePaths trkDefaultFreePaths(void) {
+    TrkFreePaths paths;
+    paths.size = sizeof(TrkFreePaths);
+    paths.t = NULL;
+    paths.tStride = 0;
+    paths.weight = NULL;
+    paths.weightStride = 0;
+    paths.extinction = NULL;
+    paths.extinctionStride = 0;
+    paths.lookups = NULL;
+    paths.lookupsStride = 0;
+    return paths;
+}
 
 /** What a volume holds. Strings live as long as the volume. */
 typedef struct TrkVolumeInfo {
-    size_t size;              /**< set by the caller: sizeof(TrkVolumeInfo) */
+    size_t size;              /**< set by the caller before the call: sizeof(TrkVolumeInfo) */
     double boundsMin[3];      /**< world-space box outside which the extinction is 0; */
     double boundsMax[3];      /**< min = max = 0 for an empty volume */
     double indexToWorld[12];  /**< world = first nine (rows) x index + last three */
@@ -244,67 +323,58 @@ typedef struct TrkVolumeInfo {
  *  "": none. A sidecar that does not fit the density is an error, never ignored.
  *  options: NULL for the defaults.
  *  Fails with INVALID_ARGUMENT, IO, BAD_FILE, GRID_NOT_FOUND, UNSUPPORTED_GRID, BAD_DENSITY,
- *  SIDECAR_MISMATCH, OUT_OF_MEMORY. Thread-safe. */
+ *  SIDECAR_MISMATCH, OUT_OF_MEMORY. Runs on TBB, apart from the caller's own tasks: cancelling
+ * those changes nothing here. Thread-safe. */
 TRK_API TrkStatus trkOpenVolume(const char* vdbPath, const char* sidecarPath,
                                 const TrkVolumeOptions* options, TrkVolume** volume);
 
 /** Releases a volume; NULL is allowed. No other call may use it any more. */
 TRK_API void trkCloseVolume(TrkVolume* volume);
 
-/** Fills *info, whose size the caller has set. Thread-safe. */
+/** Fills *info, whose size the caller has set; members of a newer header become 0. Thread-safe. */
 TRK_API TrkStatus trkGetVolumeInfo(const TrkVolume* volume, TrkVolumeInfo* info);
-
-/** A random free path. For channel k with extinction mu_k and transmittance T_k along the ray, and
- *  any function f of t: E[weight[k] f(t), where t is finite] is the integral of T_k mu_k f over the
- *  ray, and E[weight[k], where t is infinite] is the T_k of the whole ray. So a path tracer
- *  multiplies its throughput by weight x albedo where the path collides, by weight where it
- * escapes.
- */
-typedef struct TrkFreePath {
-    float t;         /**< where it collides, in the ray's own parameter; +infinity: it escapes */
-    float weight[3]; /**< per channel; a grey volume has 1 in all three. They sum to 3, so that
-                          none is larger, and are not negative */
-    float extinction[3]; /**< there, per channel, in 1/world unit; all alike in a grey volume, 0
-                              where the path escapes, and without TRK_QUERY_EXTINCTION */
-    uint32_t lookups;    /**< density values interpolated */
-} TrkFreePath;
 
 /* ---- Query ----------------------------------------------------------------------------------- */
 
-/** Estimates the transmittance of rayCount rays.
+/** Estimates the transmittance of rayCount rays. Where volumes overlap, the product of their
+ *  transmittances is that of all together, if each was given a stream of its own.
  *  query: NULL for the defaults. rays: query->rayStride bytes apart.
- *  transmittance: room for `channels` floats a ray. statistics: room for one record a ray, or NULL.
- *  A single ray takes no lock, allocation or task; a batch runs on TBB, isolated from the caller's
- * own tasks. Fails with INVALID_ARGUMENT (naming the first bad ray), NO_SIDECAR or NO_DENSITY
- * before any result is written. Thread-safe. */
+ *  transmittance: room for `channels` floats a ray, query->resultStride bytes apart.
+ *  statistics: where to put what it took, or NULL.
+ *  A single ray takes no lock, allocation or task; a batch runs on TBB, apart from the caller's own
+ *  tasks: cancelling those changes nothing here. Fails with INVALID_ARGUMENT (naming the first bad
+ *  ray), NO_SIDECAR or NO_DENSITY before any result is written. Thread-safe. */
 TRK_API TrkStatus trkEstimateTransmittance(const TrkVolume* volume, const TrkQuery* query,
                                            const TrkRay* rays, size_t rayCount,
-                                           float* transmittance, TrkStatistics* statistics);
+                                           float* transmittance, const TrkStatistics* statistics);
 
 /** Integrates the optical depth (the integral of extinction over length, without unit) of rayCount
- *  rays. query->method: TRK_METHOD_EXACT or TRK_METHOD_CONTROL. opticalDepth: room for `channels`
- *  doubles a ray. Otherwise as trkEstimateTransmittance. */
+ *  rays. query: NULL for TRK_METHOD_EXACT; query->method: TRK_METHOD_EXACT or TRK_METHOD_CONTROL.
+ *  opticalDepth: room for `channels` doubles a ray, query->resultStride bytes apart. Otherwise as
+ *  trkEstimateTransmittance. */
 TRK_API TrkStatus trkIntegrateOpticalDepth(const TrkVolume* volume, const TrkQuery* query,
                                            const TrkRay* rays, size_t rayCount,
                                            double* opticalDepth);
 
 /** Samples one free path for each of rayCount rays: where a photon collides, and with what weight.
  *  query->method: TRK_METHOD_RESIDUAL for decomposition tracking (default; the minimum of each
- * super-voxel is a control whose collisions take no look-up) or TRK_METHOD_DELTA for delta
+ *  super-voxel is a control whose collisions take no look-up) or TRK_METHOD_DELTA for delta
  * tracking. Both have the same distribution. In colour, one path serves all channels, with a weight
  * each (spectral tracking) [Kutz17]. query->samples must be 1; for several paths of a ray give
  * different streams or ray ids. A free path is independent of the transmittance estimates of the
- * same ray, stream and seed. results: room for rayCount records. Otherwise as
- * trkEstimateTransmittance. */
+ * same ray, stream and seed. paths: where to put the results; `t` must not be NULL. Otherwise as
+ *  trkEstimateTransmittance. */
 TRK_API TrkStatus trkSampleFreePath(const TrkVolume* volume, const TrkQuery* query,
-                                    const TrkRay* rays, size_t rayCount, TrkFreePath* results);
+                                    const TrkRay* rays, size_t rayCount, const TrkFreePaths* paths);
 
 /** Interpolates the extinction at pointCount points of world space, in the calling thread.
  *  points: x, y, z, finite, pointStride bytes apart; 0: 3 floats. extinction: room for `channels`
- * floats a point, in 1/world unit; 0 outside the volume. Fails with INVALID_ARGUMENT (naming the
- * first bad point) or NO_DENSITY before any result is written. Thread-safe. */
+ *  floats a point, extinctionStride bytes apart (0: without gaps), in 1/world unit; 0 outside the
+ *  volume. Fails with INVALID_ARGUMENT (naming the first bad point) or NO_DENSITY before any result
+ *  is written. Thread-safe. */
 TRK_API TrkStatus trkSampleExtinction(const TrkVolume* volume, const float* points,
-                                      size_t pointStride, size_t pointCount, float* extinction);
+                                      size_t pointStride, size_t pointCount, float* extinction,
+                                      size_t extinctionStride);
 
 #ifdef __cplusplus
 }

@@ -1,12 +1,15 @@
 // SPDX-License-Identifier: Apache-2.0
-// Move-only C++ wrapper over track.h, nothing else.
+// C++ over track.h: owners of its handles and arrays, exceptions for its statuses, nothing else.
 #pragma once
 
 #include "track/track.h"
 
+#include <cstddef>
+#include <cstdint>
 #include <stdexcept>
 #include <string>
 #include <utility>
+#include <vector>
 
 namespace track {
 
@@ -19,6 +22,68 @@ class Error : public std::runtime_error {
 
   private:
     TrkStatus status_;
+};
+
+/// A TrkQuery with the defaults, which cannot be made without saying whose random numbers it takes:
+/// results of one ray id and stream repeat each other. See TrkQuery.
+struct Query : TrkQuery {
+    /// Ray i of a call has the id firstRayId + i.
+    Query(uint64_t firstId, uint64_t ofStream) : TrkQuery(trkDefaultQuery()) {
+        firstRayId = firstId;
+        stream = ofStream;
+    }
+    /// One id for each ray of a call, which must outlive it.
+    static Query ofRays(const uint64_t* ids, uint64_t ofStream) {
+        Query query(0, ofStream);
+        query.rayIds = ids;
+        return query;
+    }
+};
+
+/// Room for all statistics of a number of rays. `channels`: the volume's.
+struct Statistics {
+    Statistics(size_t rayCount, size_t channels)
+        : standardError(rayCount * channels),
+          lookups(rayCount),
+          superVoxels(rayCount),
+          exactShare(rayCount) {}
+
+    std::vector<float> standardError;  ///< `channels` a ray
+    std::vector<uint64_t> lookups;
+    std::vector<uint64_t> superVoxels;
+    std::vector<float> exactShare;
+
+    TrkStatistics view() {
+        TrkStatistics result = trkDefaultStatistics();
+        result.standardError = standardError.data();
+        result.lookups = lookups.data();
+        result.superVoxels = superVoxels.data();
+        result.exactShare = exactShare.data();
+        return result;
+    }
+};
+
+/// Room for a number of free paths. `channels`: the volume's.
+struct FreePaths {
+    FreePaths(size_t rayCount, size_t channels)
+        : t(rayCount),
+          weight(rayCount * channels),
+          extinction(rayCount * channels),
+          lookups(rayCount) {}
+
+    std::vector<float> t;
+    std::vector<float> weight;      ///< `channels` a ray
+    std::vector<float> extinction;  ///< the same
+    std::vector<uint32_t> lookups;
+
+    TrkFreePaths view() {
+        TrkFreePaths result = trkDefaultFreePaths();
+        result.t = t.data();
+        result.weight = weight.data();
+        result.extinction = extinction.data();
+        result.lookups = lookups.data();
+        return result;
+    }
 };
 
 /// Owns a TrkVolume. Queries are const and safe from any number of threads.
@@ -45,16 +110,21 @@ class Volume {
     TrkVolume* handle() const noexcept { return handle_; }
 
     TrkVolumeInfo info() const {
-        TrkVolumeInfo info;
-        info.size = sizeof(info);
-        check(trkGetVolumeInfo(handle_, &info));
-        return info;
+        TrkVolumeInfo result;
+        result.size = sizeof(result);
+        check(trkGetVolumeInfo(handle_, &result));
+        return result;
     }
 
     /// As trkEstimateTransmittance: `channels` floats a ray. Throws Error.
-    void estimateTransmittance(const TrkQuery& query, const TrkRay* rays, size_t rayCount,
-                               float* transmittance, TrkStatistics* statistics = nullptr) const {
-        check(trkEstimateTransmittance(handle_, &query, rays, rayCount, transmittance, statistics));
+    void estimateTransmittance(const Query& query, const TrkRay* rays, size_t rayCount,
+                               float* transmittance) const {
+        check(trkEstimateTransmittance(handle_, &query, rays, rayCount, transmittance, nullptr));
+    }
+    void estimateTransmittance(const Query& query, const TrkRay* rays, size_t rayCount,
+                               float* transmittance, const TrkStatistics& statistics) const {
+        check(
+            trkEstimateTransmittance(handle_, &query, rays, rayCount, transmittance, &statistics));
     }
 
     /// As trkIntegrateOpticalDepth: `channels` doubles a ray. Throws Error.
@@ -63,16 +133,16 @@ class Volume {
         check(trkIntegrateOpticalDepth(handle_, &query, rays, rayCount, opticalDepth));
     }
 
-    /// As trkSampleFreePath: one record a ray. Throws Error.
-    void sampleFreePath(const TrkQuery& query, const TrkRay* rays, size_t rayCount,
-                        TrkFreePath* results) const {
-        check(trkSampleFreePath(handle_, &query, rays, rayCount, results));
+    /// As trkSampleFreePath. Throws Error.
+    void sampleFreePath(const Query& query, const TrkRay* rays, size_t rayCount,
+                        const TrkFreePaths& paths) const {
+        check(trkSampleFreePath(handle_, &query, rays, rayCount, &paths));
     }
 
     /// As trkSampleExtinction, of points x, y, z without gaps: `channels` floats a point. Throws
     /// Error.
     void sampleExtinction(const float* points, size_t pointCount, float* extinction) const {
-        check(trkSampleExtinction(handle_, points, 0, pointCount, extinction));
+        check(trkSampleExtinction(handle_, points, 0, pointCount, extinction, 0));
     }
 
   private:

@@ -199,6 +199,7 @@ FreePath<Field::kChannels> sampleFreePath(const Field& field, const SuperVoxels&
         // far, how to go on is free.
         double budget = settings.exactFallback ? exactCost(ray, voxels) : kMostLookups;
         double remaining = ratePerVoxel * voxels;
+        cost.random = cost.random || remaining > 0;
         while (distance < remaining) {
             remaining -= distance;
             distance = random.exponential();

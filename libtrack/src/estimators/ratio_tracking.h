@@ -82,9 +82,9 @@ class Throughput {
         return std::all_of(products_.begin(), products_.end(),
                            [](const ScaledProduct& p) { return p.isZero(); });
     }
-    /// Whether the walk goes on.
+    /// Whether the walk goes on. Sets `isRandom` where that was left to chance.
     template <class Random>
-    bool survives(Random& random) {
+    bool survives(Random& random, bool& isRandom) {
         double largest = 0;
         for (size_t c = 0; c < C; ++c) {
             if (opticalDepth_[c] < limits_[c]) {
@@ -93,6 +93,7 @@ class Throughput {
             largest = std::max(largest, std::fabs(value(c)));
         }
         const double probability = largest / kRouletteThreshold;
+        isRandom = true;
         if (!(1 - random.uniform() <= probability)) {  // at least 2^-53 where it holds
             products_.fill(ScaledProduct::zero());
             return false;
@@ -136,7 +137,7 @@ std::array<double, Field::kChannels> trackTransmittance(const Field& field,
             base = std::max(base, Method::rate(v, c, settings.rateBase));
         }
         // Where the super-voxel is homogeneous, walks do not end.
-        if (settings.roulette && base > 0 && !sofar.survives(random)) {
+        if (settings.roulette && base > 0 && !sofar.survives(random, cost.random)) {
             return false;
         }
         const double rate = base * settings.rate;
@@ -151,6 +152,7 @@ std::array<double, Field::kChannels> trackTransmittance(const Field& field,
             cost.exactLength += tExit - tEnter;
             return true;
         }
+        cost.random = cost.random || remaining > 0;
         while (distance < remaining) {
             remaining -= distance;
             const Vec3d point = ray.at(tExit - remaining / ratePerVoxel);
@@ -164,7 +166,7 @@ std::array<double, Field::kChannels> trackTransmittance(const Field& field,
             ++cost.lookups;
             // This super-voxel's control is not in the throughput yet: it may still be needed to
             // outweigh collisions that amplify.
-            if (settings.roulette ? !sofar.survives(random) : sofar.isZero()) {
+            if (settings.roulette ? !sofar.survives(random, cost.random) : sofar.isZero()) {
                 return false;
             }
             distance = random.exponential();

@@ -21,6 +21,7 @@ std::array<double, Field::kChannels> marchOpticalDepth(const Field& field, const
     constexpr size_t C = Field::kChannels;
     std::array<double, C> sum{};
     const double offset = random.uniform();
+    cost.random = true;
     double next = 0;  // index of the next look-up
     field.forEachRegion(ray, 0, ray.tEnd, [&](const auto* constant, double tEnter, double tExit) {
         ++cost.superVoxels;

@@ -14,6 +14,7 @@ struct PathCost {
     uint64_t lookups = 0;      ///< density values interpolated
     uint64_t superVoxels = 0;  ///< occupied regions met
     double exactLength = 0;    ///< voxel lengths integrated exactly
+    bool random = false;       ///< another sample might have another result
 };
 
 /// What the rate of collisions is a multiple of: a bound of what is sampled, or its root mean

@@ -1,7 +1,7 @@
 // SPDX-License-Identifier: Apache-2.0
 #include "density.h"
 
-#include "../error.h"
+#include "../failure.h"
 #include "density_types.h"
 #include "field_builder.h"
 #include "vdb_file.h"
@@ -97,18 +97,18 @@ void checkValues(const TreeScan& scan, const Value& background, uint32_t repair,
              << "; expected 0, or the extinction has no end";
         throw Error(TRK_ERROR_BAD_DENSITY, line.str());
     }
-    const auto refuse = [&](const BadValues& bad, const char* kind, const char* option) {
+    const auto refuse = [&](const BadValues& bad, const char* kind, const char* repairBit) {
         std::ostringstream line;
         line << where << ": " << bad.count << (bad.count == 1 ? " voxel is " : " voxels are ")
              << kind << ", the first at index (" << bad.first[0] << ", " << bad.first[1] << ", "
-             << bad.first[2] << "); expected finite values >= 0 (" << option << " makes them 0)";
+             << bad.first[2] << "); expected finite values >= 0 (" << repairBit << " makes them 0)";
         throw Error(TRK_ERROR_BAD_DENSITY, line.str());
     };
     if (scan.nonfinite.count > 0 && !(repair & TRK_REPAIR_DROP_NONFINITE)) {
-        refuse(scan.nonfinite, "NaN or infinite as float", "--drop-nonfinite");
+        refuse(scan.nonfinite, "NaN or infinite as float", "TRK_REPAIR_DROP_NONFINITE");
     }
     if (scan.negative.count > 0 && !(repair & TRK_REPAIR_CLAMP_NEGATIVE)) {
-        refuse(scan.negative, "negative", "--clamp-negative");
+        refuse(scan.negative, "negative", "TRK_REPAIR_CLAMP_NEGATIVE");
     }
 }
 

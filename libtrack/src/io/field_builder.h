@@ -3,15 +3,12 @@
 // wherever a vertex is not constant. Work and memory go with the leaves, not with tiles or boxes.
 #pragma once
 
-#include "../error.h"
 #include "../extinction_field.h"
+#include "../failure.h"
 #include "../hash.h"
+#include "../parallel.h"
 #include "density_types.h"
 #include "tree_regions.h"
-
-#include <tbb/blocked_range.h>
-#include <tbb/parallel_for.h>
-#include <tbb/parallel_reduce.h>
 
 #include <algorithm>
 #include <array>
@@ -287,18 +284,8 @@ void FieldBuilder<TreeType>::scanTree() {
             }
         }
     }
-    scan_ = tbb::parallel_reduce(
-        tbb::blocked_range<size_t>(0, leaves_.size(), 64), TreeScan{},
-        [&](const tbb::blocked_range<size_t>& range, TreeScan part) {
-            for (size_t i = range.begin(); i != range.end(); ++i) {
-                scanLeaf(*leaves_[i], part);
-            }
-            return part;
-        },
-        [](TreeScan a, const TreeScan& b) {
-            a.join(b);
-            return a;
-        });
+    scan_ = parallelSum<TreeScan>(leaves_.size(), 64,
+                                  [&](size_t i, TreeScan& part) { scanLeaf(*leaves_[i], part); });
     for (const Tile& tile : tiles_) {
         scanTile(tile, scan_);
     }
@@ -375,15 +362,14 @@ ExtinctionField FieldBuilder<TreeType>::build(const Int3& anchor, uint64_t maxMe
     // First pass: which bricks are constant after all. Second: fill the others, exactly allocated.
     const size_t jobCount = plan.jobs.size();
     const auto forEachJob = [&](const auto& body) {
-        tbb::parallel_for(tbb::blocked_range<size_t>(0, jobCount, 64),
-                          [&](const tbb::blocked_range<size_t>& range) {
-                              Regions local(tree_);
-                              Vertices vertices;
-                              for (size_t i = range.begin(); i != range.end(); ++i) {
-                                  gather(local, plan.jobs[i], vertices);
-                                  body(i, vertices);
-                              }
-                          });
+        parallelRanges(jobCount, 64, [&](size_t begin, size_t end) {
+            Regions local(tree_);
+            Vertices vertices;
+            for (size_t i = begin; i != end; ++i) {
+                gather(local, plan.jobs[i], vertices);
+                body(i, vertices);
+            }
+        });
     };
     FieldValue notConstant;
     notConstant.fill(-1);

@@ -1,7 +1,7 @@
 // SPDX-License-Identifier: Apache-2.0
 #include "output_file.h"
 
-#include "../error.h"
+#include "../failure.h"
 
 #include <fcntl.h>
 #include <sys/stat.h>
@@ -106,6 +106,11 @@ OutputFile::OutputFile(std::string target, bool force) : target_(std::move(targe
     }
     struct stat info = {};
     const bool replaces = stat(target_.c_str(), &info) == 0;
+    if (!replaces && std::filesystem::is_symlink(target_)) {
+        throw Error(TRK_ERROR_IO, target_ + ": is a link to a file that does not exist, " +
+                                      std::filesystem::read_symlink(target_).string() +
+                                      "; expected a file, or a link to one");
+    }
     if (replaces) {
         if (S_ISDIR(info.st_mode)) {
             throw Error(TRK_ERROR_IO, target_ + ": is a directory; expected a file name");
@@ -119,37 +124,38 @@ OutputFile::OutputFile(std::string target, bool force) : target_(std::move(targe
             target_ = std::filesystem::canonical(target_).string();
         }
         if (!force_) {
-            throw Error(TRK_ERROR_IO, target_ + ": exists already; --force replaces it");
+            throw Error(TRK_ERROR_IO,
+                        target_ + ": exists already, and replacing it was not asked for");
         }
     }
     std::string folder = std::filesystem::path(target_).parent_path().string();
     if (folder.empty()) {
         folder = ".";
     }
-    descriptor_ = open(folder.c_str(), O_TMPFILE | O_WRONLY | O_CLOEXEC, 0666);
-    if (descriptor_ >= 0) {
-        path_ = "/proc/self/fd/" + std::to_string(descriptor_);
+    resource_.descriptor = open(folder.c_str(), O_TMPFILE | O_WRONLY | O_CLOEXEC, 0666);
+    if (resource_.descriptor >= 0) {
+        path_ = "/proc/self/fd/" + std::to_string(resource_.descriptor);
     } else if (errno != EOPNOTSUPP && errno != EISDIR && errno != EINVAL) {
         fail(target_, "cannot be written", errno);
     } else {
         makeTemporaryName([&](const char* name) {
-            descriptor_ = open(name, O_CREAT | O_EXCL | O_WRONLY | O_CLOEXEC, 0666);
-            return descriptor_ >= 0;
+            resource_.descriptor = open(name, O_CREAT | O_EXCL | O_WRONLY | O_CLOEXEC, 0666);
+            return resource_.descriptor >= 0;
         });
-        path_ = temporaryName_;
+        path_ = resource_.temporaryName;
     }
-    if (replaces && fchmod(descriptor_, info.st_mode & 07777) != 0) {
+    if (replaces && fchmod(resource_.descriptor, info.st_mode & 07777) != 0) {
         fail(target_, "cannot keep its permissions", errno);
     }
 }
 
-OutputFile::~OutputFile() {
-    if (!temporaryName_.empty()) {
-        forgetTemporary(temporaryName_);
-        unlink(temporaryName_.c_str());
+OutputFile::Resource::~Resource() {
+    if (!temporaryName.empty()) {
+        forgetTemporary(temporaryName);
+        unlink(temporaryName.c_str());
     }
-    if (descriptor_ >= 0) {
-        close(descriptor_);
+    if (descriptor >= 0) {
+        close(descriptor);
     }
 }
 
@@ -158,7 +164,7 @@ void OutputFile::makeTemporaryName(const std::function<bool(const char*)>& creat
         const std::string name =
             target_ + ".tmp" + std::to_string(getpid()) + "-" + std::to_string(attempt);
         if (create(name.c_str())) {
-            temporaryName_ = name;
+            resource_.temporaryName = name;
             rememberTemporary(name);
             return;
         }
@@ -169,7 +175,7 @@ void OutputFile::makeTemporaryName(const std::function<bool(const char*)>& creat
 }
 
 void OutputFile::commit() {
-    if (fsync(descriptor_) != 0) {
+    if (fsync(resource_.descriptor) != 0) {
         fail(target_, "cannot be flushed to disk", errno);
     }
     const auto linkTo = [&](const char* name) {
@@ -177,11 +183,13 @@ void OutputFile::commit() {
     };
     const auto failIfTaken = [&] {
         if (errno == EEXIST) {
-            throw Error(TRK_ERROR_IO,
-                        target_ + ": was written by somebody else meanwhile; --force replaces it");
+            throw Error(
+                TRK_ERROR_IO,
+                target_ +
+                    ": was written by somebody else meanwhile, and replacing it was not asked for");
         }
     };
-    if (temporaryName_.empty()) {
+    if (resource_.temporaryName.empty()) {
         if (!force_ && linkTo(target_.c_str())) {  // never replaces: of two writers, one fails
             return;
         }
@@ -191,20 +199,20 @@ void OutputFile::commit() {
         makeTemporaryName(linkTo);
     }
     if (!force_) {
-        if (renameat2(AT_FDCWD, temporaryName_.c_str(), AT_FDCWD, target_.c_str(),
+        if (renameat2(AT_FDCWD, resource_.temporaryName.c_str(), AT_FDCWD, target_.c_str(),
                       RENAME_NOREPLACE) == 0) {
-            forgetTemporary(temporaryName_);
-            temporaryName_.clear();
+            forgetTemporary(resource_.temporaryName);
+            resource_.temporaryName.clear();
             return;
         }
         failIfTaken();
         // A file system that cannot do either: the check of the constructor must do.
     }
-    if (rename(temporaryName_.c_str(), target_.c_str()) != 0) {
+    if (rename(resource_.temporaryName.c_str(), target_.c_str()) != 0) {
         fail(target_, force_ ? "cannot be replaced" : "cannot be written", errno);
     }
-    forgetTemporary(temporaryName_);
-    temporaryName_.clear();
+    forgetTemporary(resource_.temporaryName);
+    resource_.temporaryName.clear();
 }
 
 }  // namespace trk

@@ -15,7 +15,6 @@ class OutputFile {
     /// Throws Error (IO): the folder is missing or read-only, the target is a directory, or it
     /// exists and `force` is false.
     OutputFile(std::string target, bool force);
-    ~OutputFile();
     OutputFile(const OutputFile&) = delete;
     OutputFile& operator=(const OutputFile&) = delete;
 
@@ -30,11 +29,18 @@ class OutputFile {
     /// Finds a free name beside the target; `create(name)` answers whether it made that file.
     void makeTemporaryName(const std::function<bool(const char*)>& create);
 
+    /// Closed, and its temporary name removed, however the constructor ends.
+    struct Resource {
+        std::string temporaryName;  // empty while the file has none
+        int descriptor = -1;
+
+        ~Resource();
+    };
+
     std::string target_;
     std::string path_;
-    std::string temporaryName_;  // empty while the file has none
+    Resource resource_;
     bool force_;
-    int descriptor_ = -1;
 };
 
 /// A folder for output files, made where it was missing, and removed again, also by

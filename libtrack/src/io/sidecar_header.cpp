@@ -1,7 +1,7 @@
 // SPDX-License-Identifier: Apache-2.0
 #include "sidecar_header.h"
 
-#include "../error.h"
+#include "../failure.h"
 #include "density_types.h"
 #include "sidecar_schema.h"
 
@@ -69,9 +69,7 @@ SidecarHeader readHeader(VdbFile& file) {
     const VdbEntry* control = findControl(file);
     if (!control) {
         badSidecar(file.path(),
-                   "no grid …_control; expected a sidecar made by `vdbtrack bake`; the "
-                   "file has " +
-                       file.listing());
+                   "no grid …_control; expected a sidecar; the file has " + file.listing());
     }
     const std::string where = file.path() + ": grid " + control->name;
     const openvdb::GridBase::Ptr grid = file.readMetadata(*control);

@@ -1,7 +1,7 @@
 // SPDX-License-Identifier: Apache-2.0
 #include "sidecar.h"
 
-#include "../error.h"
+#include "../failure.h"
 #include "../hash.h"
 #include "density_types.h"
 #include "sidecar_header.h"

@@ -3,7 +3,7 @@
 // transforms.
 #pragma once
 
-#include "../math.h"
+#include "../geometry.h"
 #include "../super_voxels.h"
 
 #include <algorithm>

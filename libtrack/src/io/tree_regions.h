@@ -2,7 +2,7 @@
 // Questions about whole regions of an OpenVDB tree, answered from its nodes, in 64-bit coordinates.
 #pragma once
 
-#include "../math.h"
+#include "../geometry.h"
 #include "openvdb_grids.h"
 
 #include <openvdb/tree/ValueAccessor.h>

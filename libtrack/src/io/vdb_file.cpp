@@ -1,7 +1,7 @@
 // SPDX-License-Identifier: Apache-2.0
 #include "vdb_file.h"
 
-#include "../error.h"
+#include "../failure.h"
 #include "density_types.h"
 #include "guarded_stream.h"
 

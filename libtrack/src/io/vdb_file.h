@@ -3,7 +3,7 @@
 // that names the file. OpenVDB's own reader goes on past the end of a truncated file.
 #pragma once
 
-#include "../math.h"
+#include "../geometry.h"
 #include "openvdb_grids.h"
 
 #include <cstdint>

@@ -1,0 +1,267 @@
+// SPDX-License-Identifier: Apache-2.0
+// That the library leaves its host alone, and the host the library: cancelled task groups, structs
+// of other versions, identities of random numbers.
+#include "track/track.hpp"
+
+#include "support/fixtures.h"
+#include "support/rays.h"
+
+#include <gtest/gtest.h>
+#include <tbb/parallel_for.h>
+#include <tbb/task_group.h>
+
+#include <cstring>
+#include <string>
+#include <vector>
+
+namespace {
+
+struct Files {
+    std::string vdb = fixtures::cloudFile(64);
+    std::string sidecar = fixtures::path("host.track.vdb");
+    Files() { fixtures::bake(vdb, sidecar, 8); }
+};
+
+track::Volume openCloud(float scale = 3) {
+    static const Files files;
+    TrkVolumeOptions options = trkDefaultVolumeOptions();
+    options.scale = scale;
+    return track::Volume::open(files.vdb, files.sidecar.c_str(), options);
+}
+
+/// Calls body() in a task group that is cancelled already.
+template <class Body>
+void inCancelledGroup(const Body& body) {
+    tbb::task_group_context context;
+    tbb::parallel_for(
+        0, 1,
+        [&](int) {
+            context.cancel_group_execution();
+            body();
+        },
+        context);
+}
+
+TEST(Host, ACancelledTaskGroupDoesNotEndABatch) {
+    const track::Volume volume = openCloud();
+    const std::vector<TrkRay> all = rays::through(rays::boundsOf(volume.info()), 3000, 20, 1);
+    const track::Query query(0, 0);
+    std::vector<float> expected(all.size());
+    volume.estimateTransmittance(query, all.data(), all.size(), expected.data());
+    for (int i = 0; i < 200; ++i) {
+        std::vector<float> found(all.size(), -7);
+        std::vector<float> t(all.size(), -7);
+        TrkFreePaths paths = trkDefaultFreePaths();
+        paths.t = t.data();
+        inCancelledGroup([&] {
+            volume.estimateTransmittance(query, all.data(), all.size(), found.data());
+            volume.sampleFreePath(query, all.data(), all.size(), paths);
+        });
+        ASSERT_EQ(found, expected);
+        ASSERT_EQ(std::count(t.begin(), t.end(), -7.0f), 0);
+    }
+}
+
+TEST(Host, ACancelledTaskGroupDoesNotChangeWhatIsOpened) {
+    const std::vector<TrkRay> all = rays::through(rays::boundsOf(openCloud().info()), 2000, 20, 1);
+    track::Query query(0, 0);
+    query.method = TRK_METHOD_EXACT;
+    std::vector<float> expected(all.size());
+    openCloud().estimateTransmittance(query, all.data(), all.size(), expected.data());
+    for (int i = 0; i < (fixtures::kSanitized ? 20 : 200); ++i) {
+        std::vector<float> found(all.size(), -7);
+        inCancelledGroup([&] {
+            openCloud().estimateTransmittance(query, all.data(), all.size(), found.data());
+        });
+        ASSERT_EQ(found, expected);
+    }
+}
+
+/// A struct of a newer header.
+template <class Struct>
+struct Newer {
+    Struct known;
+    uint64_t later = 0;
+
+    explicit Newer(const Struct& s) : known(s) { known.size = sizeof(*this); }
+};
+
+template <class Call>
+void expectCompleted(const char* name, const Call& call) {
+    call(0, TRK_OK);
+    call(1, TRK_ERROR_INVALID_ARGUMENT);
+    EXPECT_NE(std::string(trkGetLastErrorMessage()).find(name), std::string::npos)
+        << trkGetLastErrorMessage();
+}
+
+TEST(Host, StructsOfNewerHeadersAreTakenWhereTheRestIsZero) {
+    const track::Volume volume = openCloud();
+    const TrkRay ray = rays::through(rays::boundsOf(volume.info()), 1, 20, 1)[0];
+    expectCompleted("TrkQuery", [&](uint64_t later, TrkStatus expected) {
+        Newer<TrkQuery> query(trkDefaultQuery());
+        query.later = later;
+        float out = -7;
+        EXPECT_EQ(trkEstimateTransmittance(volume.handle(), &query.known, &ray, 1, &out, nullptr),
+                  expected);
+        EXPECT_EQ(out == -7, expected != TRK_OK);
+    });
+    expectCompleted("TrkStatistics", [&](uint64_t later, TrkStatus expected) {
+        Newer<TrkStatistics> statistics(trkDefaultStatistics());
+        statistics.later = later;
+        float out = -7;
+        EXPECT_EQ(
+            trkEstimateTransmittance(volume.handle(), nullptr, &ray, 1, &out, &statistics.known),
+            expected);
+    });
+    expectCompleted("TrkFreePaths", [&](uint64_t later, TrkStatus expected) {
+        float t = 0;
+        Newer<TrkFreePaths> paths(trkDefaultFreePaths());
+        paths.known.t = &t;
+        paths.later = later;
+        EXPECT_EQ(trkSampleFreePath(volume.handle(), nullptr, &ray, 1, &paths.known), expected);
+    });
+    expectCompleted("TrkVolumeOptions", [&](uint64_t later, TrkStatus expected) {
+        Newer<TrkVolumeOptions> options(trkDefaultVolumeOptions());
+        options.later = later;
+        TrkVolume* opened = nullptr;
+        EXPECT_EQ(trkOpenVolume(fixtures::cloudFile(64).c_str(), "", &options.known, &opened),
+                  expected);
+        trkCloseVolume(opened);
+    });
+    Newer<TrkVolumeInfo> info{TrkVolumeInfo{}};
+    info.later = 42;
+    EXPECT_EQ(trkGetVolumeInfo(volume.handle(), &info.known), TRK_OK);
+    EXPECT_EQ(info.later, 0u);
+    EXPECT_EQ(info.known.superVoxelSize, 8u);
+    EXPECT_EQ(info.known.size, sizeof(info));
+}
+
+TEST(Host, StructsTooSmallToBeAnyAreRefused) {
+    const track::Volume volume = openCloud();
+    TrkVolumeInfo info = {};
+    for (const size_t size : {size_t{0}, size_t{8}, sizeof(info) - 8}) {
+        info.size = size;
+        EXPECT_EQ(trkGetVolumeInfo(volume.handle(), &info), TRK_ERROR_INVALID_ARGUMENT);
+        EXPECT_NE(std::string(trkGetLastErrorMessage()).find("TrkVolumeInfo.size"),
+                  std::string::npos);
+        EXPECT_EQ(info.boundsMax[0], 0);
+    }
+    TrkQuery query = trkDefaultQuery();
+    const TrkRay ray{{0, 0, 0}, 0, {1, 0, 0}, 1};
+    float out = -7;
+    for (const size_t size : {size_t{0}, size_t{8}, sizeof(query) - 8, size_t{1} << 40}) {
+        query.size = size;
+        EXPECT_EQ(trkEstimateTransmittance(volume.handle(), &query, &ray, 1, &out, nullptr),
+                  TRK_ERROR_INVALID_ARGUMENT);
+        EXPECT_EQ(out, -7);
+    }
+}
+
+TEST(Host, AQueryOfNullIsTheDefaultOfItsFunction) {
+    const track::Volume volume = openCloud();
+    const TrkRay ray = rays::through(rays::boundsOf(volume.info()), 1, 20, 3)[0];
+    track::Query query(0, 0);
+    float expected = -1;
+    float found = -2;
+    volume.estimateTransmittance(query, &ray, 1, &expected);
+    EXPECT_EQ(trkEstimateTransmittance(volume.handle(), nullptr, &ray, 1, &found, nullptr), TRK_OK);
+    EXPECT_EQ(found, expected);
+    query.method = TRK_METHOD_EXACT;
+    double expectedDepth = -1;
+    double foundDepth = -2;
+    volume.integrateOpticalDepth(query, &ray, 1, &expectedDepth);
+    EXPECT_EQ(trkIntegrateOpticalDepth(volume.handle(), nullptr, &ray, 1, &foundDepth), TRK_OK);
+    EXPECT_EQ(foundDepth, expectedDepth);
+}
+
+TEST(Host, ErrorsNameConstantsOfTheLibraryAndThePathThatIsMissing) {
+    TrkVolume* volume = nullptr;
+    const auto failing = [&](const char* vdb, const char* sidecar) {
+        EXPECT_EQ(trkOpenVolume(vdb, sidecar, nullptr, &volume), TRK_ERROR_INVALID_ARGUMENT);
+        return std::string(trkGetLastErrorMessage());
+    };
+    EXPECT_NE(failing("", nullptr).find("vdbPath is empty"), std::string::npos);
+    EXPECT_NE(failing(nullptr, nullptr).find("vdbPath is NULL"), std::string::npos);
+    EXPECT_NE(failing(nullptr, "").find("sidecarPath"), std::string::npos);
+
+    auto grid = fixtures::makeBlob(8);
+    grid->tree().setValueOn(openvdb::Coord(1, 2, 3), -1.0f);
+    const std::string vdb = fixtures::write("negative.vdb", {grid});
+    EXPECT_EQ(trkOpenVolume(vdb.c_str(), "", nullptr, &volume), TRK_ERROR_BAD_DENSITY);
+    const std::string line = trkGetLastErrorMessage();
+    EXPECT_NE(line.find("TRK_REPAIR_CLAMP_NEGATIVE"), std::string::npos) << line;
+    EXPECT_EQ(line.find("--"), std::string::npos) << line;
+}
+
+TEST(Host, ResultsAndStatisticsMayBeStrided) {
+    struct Pixel {
+        double depth;
+        float transmittance;
+        float standardError;
+        uint64_t lookups;
+        uint64_t superVoxels;
+        float exactShare;
+        float other;
+    };
+    const track::Volume volume = openCloud();
+    const std::vector<TrkRay> all = rays::through(rays::boundsOf(volume.info()), 50, 20, 1);
+    track::Query query(0, 0);
+    query.samples = 4;
+    std::vector<float> dense(all.size());
+    track::Statistics statistics(all.size(), 1);
+    volume.estimateTransmittance(query, all.data(), all.size(), dense.data(), statistics.view());
+    std::vector<Pixel> pixels(all.size(), {0, 0, 0, 0, 0, 0, 42});
+    query.resultStride = sizeof(Pixel);
+    TrkStatistics view = trkDefaultStatistics();
+    view.standardError = &pixels[0].standardError;
+    view.lookups = &pixels[0].lookups;
+    view.superVoxels = &pixels[0].superVoxels;
+    view.exactShare = &pixels[0].exactShare;
+    view.standardErrorStride = view.lookupsStride = view.superVoxelsStride = view.exactShareStride =
+        sizeof(Pixel);
+    volume.estimateTransmittance(query, all.data(), all.size(), &pixels[0].transmittance, view);
+    query.method = TRK_METHOD_EXACT;
+    volume.integrateOpticalDepth(query, all.data(), all.size(), &pixels[0].depth);
+    query.resultStride = 0;
+    std::vector<double> depth(all.size());
+    volume.integrateOpticalDepth(query, all.data(), all.size(), depth.data());
+    for (size_t i = 0; i < all.size(); ++i) {
+        EXPECT_EQ(pixels[i].transmittance, dense[i]);
+        EXPECT_EQ(std::memcmp(&pixels[i].standardError, &statistics.standardError[i], 4), 0);
+        EXPECT_EQ(pixels[i].lookups, statistics.lookups[i]);
+        EXPECT_EQ(pixels[i].superVoxels, statistics.superVoxels[i]);
+        EXPECT_EQ(pixels[i].exactShare, statistics.exactShare[i]);
+        EXPECT_EQ(pixels[i].depth, depth[i]);
+        EXPECT_EQ(pixels[i].other, 42);
+    }
+    query.resultStride = 6;
+    EXPECT_EQ(
+        trkEstimateTransmittance(volume.handle(), &query, all.data(), 1, dense.data(), nullptr),
+        TRK_ERROR_INVALID_ARGUMENT);
+}
+
+// What the README shows: samples of a pixel, and pixels, have numbers of their own.
+TEST(Host, CallsOfOneIdRepeatAndOfOthersDoNot) {
+    const track::Volume volume = openCloud(0.5f);
+    const TrkVolumeInfo info = volume.info();
+    TrkRay ray{{}, 0, {1, 0.1f, 0.2f}, rays::kInfinity};  // from the middle
+    for (int a = 0; a < 3; ++a) {
+        ray.origin[a] = static_cast<float>(0.5 * (info.boundsMin[a] + info.boundsMax[a]));
+    }
+    const auto estimate = [&](uint64_t id, uint64_t stream) {
+        track::Query query(id, stream);
+        query.method = TRK_METHOD_RATIO;
+        float out = 0;
+        volume.estimateTransmittance(query, &ray, 1, &out);
+        return out;
+    };
+    EXPECT_EQ(estimate(7, 1), estimate(7, 1));
+    size_t repeated = 0;
+    for (uint64_t i = 0; i < 100; ++i) {
+        repeated += estimate(i, 0) == estimate(i + 1, 0) ? 1 : 0;
+        repeated += estimate(7, i) == estimate(7, i + 1) ? 1 : 0;
+    }
+    EXPECT_LT(repeated, 100u);
+}
+
+}  // namespace

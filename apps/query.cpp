@@ -1,11 +1,15 @@
 // SPDX-License-Identifier: Apache-2.0
-// vdbtrack query: transmittance of the rays of a CSV file.
+// vdbtrack query: transmittance of the rays of a CSV file, exact unless a random method is asked
+// for.
 #include "command_line.h"
 
+#include "batch.h"
 #include "failure.h"
 #include "io/output_file.h"
 #include "io/sidecar.h"
+#include "known_error.h"
 #include "names.h"
+#include "parallel.h"
 #include "ray_file.h"
 #include "track/track.hpp"
 
@@ -15,6 +19,7 @@
 #include <cstdio>
 #include <filesystem>
 #include <fstream>
+#include <functional>
 #include <iostream>
 #include <limits>
 #include <sstream>
@@ -60,33 +65,127 @@ void forEachChunk(const Arguments& arguments, size_t rayCount, const Answer& ans
     }
 }
 
-std::string transmittances(const Arguments& arguments, const track::Volume& volume,
-                           track::Query query, const std::vector<TrkRay>& rays) {
-    const size_t channels = volume.info().channels;
+/// The answers to some rays, `channels` values each.
+struct Answers {
+    Answers(size_t count, size_t channels)
+        : transmittance(count * channels),
+          depth(count * channels, std::numeric_limits<double>::quiet_NaN()),
+          statistics(count, channels),
+          samples(count) {}
+
+    std::vector<float> transmittance;
+    std::vector<double> depth;  ///< NaN where the method has none
+    track::Statistics statistics;
+    std::vector<uint32_t> samples;  ///< 0 where it was integrated exactly
+};
+
+/// Rays whose standard error is not known, and how many of them nothing came through.
+struct Unknown {
+    size_t rays = 0;
+    size_t dark = 0;
+};
+
+/// One line on stderr on the errors that are empty, and what can be said instead.
+void noteUnknown(const Unknown& unknown, const TrkQuery& query) {
+    if (unknown.rays == 0) {
+        return;
+    }
+    std::cerr << "vdbtrack: note: " << unknown.rays
+              << (unknown.rays == 1 ? " ray has" : " rays have") << " no standard error: ";
+    if (query.method == TRK_METHOD_CONTROL || query.method == TRK_METHOD_MARCH) {
+        std::cerr << vdbtools::kMethodNames[static_cast<size_t>(query.method)]
+                  << " is biased, by an amount that only --method exact tells\n";
+        return;
+    }
+    if (query.samples == 1) {
+        std::cerr << "with --roulette, one sample shows none\n";
+        return;
+    }
+    std::cerr << "all " << query.samples << " samples agree";
+    // Of estimates between 0 and 1, more than the share that is not 0 cannot get through.
+    if (unknown.dark > 0 && query.method == TRK_METHOD_RATIO && query.rate >= 1 &&
+        query.rateBase == TRK_RATE_BASE_MAJORANT) {
+        char bound[32];
+        std::snprintf(bound, sizeof(bound), "%.2g", 1 - std::pow(0.05, 1.0 / query.samples));
+        std::cerr << "; no sample got through " << unknown.dark << " of them: T < " << bound
+                  << " at 95 %";
+    }
+    std::cerr << "; without --roulette all have one\n";
+}
+
+std::string table(const Arguments& arguments, size_t channels, const TrkQuery& query,
+                  const std::vector<TrkRay>& rays,
+                  const std::function<void(size_t begin, size_t count, Answers&)>& answer) {
     std::ostringstream out;
+    const bool bySamples = arguments.has("error");
     out << "ray," << columns("transmittance", channels) << ',' << columns("stderr", channels) << ','
-        << columns("optical_depth", channels) << ",lookups\n";
-    const bool deterministic =
-        query.method == TRK_METHOD_EXACT || query.method == TRK_METHOD_CONTROL;
+        << columns("optical_depth", channels) << ",lookups" << (bySamples ? ",samples\n" : "\n");
+    Unknown unknown;
     forEachChunk(arguments, rays.size(), [&](size_t begin, size_t count) {
-        std::vector<float> transmittance(count * channels);
-        track::Statistics statistics(count, channels);
-        std::vector<double> depth(count * channels, std::numeric_limits<double>::quiet_NaN());
-        query.firstRayId = begin;
-        volume.estimateTransmittance(query, &rays[begin], count, transmittance.data(),
-                                     statistics.view());
-        if (deterministic) {
-            volume.integrateOpticalDepth(query, &rays[begin], count, depth.data());
-        }
+        Answers answers(count, channels);
+        answer(begin, count, answers);
         for (size_t i = 0; i < count; ++i) {
+            const float* error = &answers.statistics.standardError[i * channels];
+            const float* value = &answers.transmittance[i * channels];
+            if (std::any_of(error, error + channels, [](float e) { return std::isnan(e); })) {
+                ++unknown.rays;
+                unknown.dark += *std::max_element(value, value + channels) == 0 ? 1 : 0;
+            }
             out << begin + i;
-            addColumns(out, &transmittance[i * channels], channels);
-            addColumns(out, &statistics.standardError[i * channels], channels);
-            addColumns(out, &depth[i * channels], channels);
-            out << ',' << statistics.lookups[i] << '\n';
+            addColumns(out, value, channels);
+            addColumns(out, error, channels);
+            addColumns(out, &answers.depth[i * channels], channels);
+            out << ',' << answers.statistics.lookups[i];
+            if (bySamples) {
+                out << ',' << answers.samples[i];
+            }
+            out << '\n';
         }
     });
+    if (!arguments.quiet()) {
+        noteUnknown(unknown, query);
+    }
     return out.str();
+}
+
+/// By the C API; standard errors are what the samples show.
+std::string transmittances(const Arguments& arguments, const track::Volume& volume,
+                           track::Query query, const std::vector<TrkRay>& rays) {
+    const bool hasDepth = query.method == TRK_METHOD_EXACT || query.method == TRK_METHOD_CONTROL;
+    return table(
+        arguments, volume.info().channels, query, rays,
+        [&](size_t begin, size_t count, Answers& answers) {
+            query.firstRayId = begin;
+            volume.estimateTransmittance(query, &rays[begin], count, answers.transmittance.data(),
+                                         answers.statistics.view());
+            if (hasDepth) {
+                volume.integrateOpticalDepth(query, &rays[begin], count, answers.depth.data());
+            }
+        });
+}
+
+/// By a random method without roulette, whose standard errors are known.
+std::string certainTransmittances(const Arguments& arguments, const trk::Volume& volume,
+                                  const TrkQuery& query, const std::vector<TrkRay>& rays) {
+    const size_t channels = volume.channels();
+    const double wanted =
+        arguments.has("error") ? static_cast<double>(arguments.get<float>("error")) : 0;
+    return table(arguments, channels, query, rays,
+                 [&](size_t begin, size_t count, Answers& answers) {
+                     trk::parallelFor(count, 16, [&](size_t i) {
+                         const auto estimate = vdbtools::estimateWithKnownError(
+                             volume, query, rays[begin + i], begin + i, wanted);
+                         const auto put = [&](const auto& from, auto& to) {
+                             std::copy_n(from.begin(), channels,
+                                         to.begin() + static_cast<std::ptrdiff_t>(i * channels));
+                         };
+                         put(estimate.transmittance, answers.transmittance);
+                         put(estimate.standardError, answers.statistics.standardError);
+                         put(estimate.opticalDepth, answers.depth);
+                         answers.statistics.lookups[i] = estimate.lookups;
+                         answers.samples[i] = estimate.samples;
+                     });
+                 });
 }
 
 std::string freePaths(const Arguments& arguments, const track::Volume& volume, track::Query query,
@@ -113,8 +212,10 @@ std::string freePaths(const Arguments& arguments, const track::Volume& volume, t
 track::Query queryOf(const Arguments& arguments) {
     track::Query query(0, arguments.get<uint64_t>("stream"));
     const std::string method = arguments.text("method");
-    query.method = choiceIndex("method", method, vdbtools::kMethodNames);
     const bool freePaths = arguments.flag("free-paths");
+    query.method = freePaths && !arguments.given("method")
+                       ? TRK_METHOD_RESIDUAL
+                       : choiceIndex("method", method, vdbtools::kMethodNames);
     const auto needs = [&](const char* option, bool holds, const char* what) {
         if (arguments.given(option) && !holds) {
             throw UsageError("--" + std::string(option) + ": of no use with " +
@@ -123,24 +224,41 @@ track::Query queryOf(const Arguments& arguments) {
     };
     const bool tracksRatios =
         !freePaths && (query.method == TRK_METHOD_RESIDUAL || query.method == TRK_METHOD_RATIO);
+    const bool tracks = tracksRatios || freePaths || query.method == TRK_METHOD_DELTA;
+    const bool isRandom = tracks || query.method == TRK_METHOD_MARCH;
     needs("level", query.method == TRK_METHOD_CONTROL, "only control has levels");
     needs("step", query.method == TRK_METHOD_MARCH, "only march takes steps");
     needs("rate-base", tracksRatios, "only residual and ratio have one");
-    needs("samples", !freePaths, "each ray of the file gets one path");
-    const bool tracks = tracksRatios || freePaths || query.method == TRK_METHOD_DELTA;
+    needs("samples", isRandom && !freePaths,
+          freePaths ? "each ray of the file gets one path" : "only random methods take samples");
+    needs("error", tracks && !freePaths,
+          "only residual, ratio and delta have a variance to choose by");
     needs("rate", tracks, "only residual, ratio, delta and free paths have one");
     needs("global", tracks, "only residual, ratio, delta and free paths walk over super-voxels");
     needs("choice", query.method == TRK_METHOD_RESIDUAL && !freePaths, "only residual has one");
-    needs("no-roulette", tracksRatios, "only residual and ratio have one");
+    needs("roulette", tracksRatios, "only residual and ratio have one");
+    needs("seed", isRandom, "nothing is random");
+    needs("stream", isRandom, "nothing is random");
+    if (arguments.flag("roulette") && arguments.has("error")) {
+        throw UsageError(
+            "--error and --roulette: expected one of them, as the variance that roulette "
+            "adds has no formula");
+    }
+    if (arguments.has("error") && !(arguments.get<float>("error") > 0)) {
+        throw UsageError("--error: expected a number > 0");
+    }
     if (freePaths && query.method != TRK_METHOD_RESIDUAL && query.method != TRK_METHOD_DELTA) {
         throw UsageError(
             "--free-paths: expected --method residual (decomposition tracking) or "
             "delta, found " +
             method);
     }
+    const int samples = arguments.integer("samples", 1, std::numeric_limits<int>::max());
+    constexpr int kMostForError = 1 << 20;
     query.samples = freePaths ? 1u
-                              : static_cast<uint32_t>(arguments.integer(
-                                    "samples", 1, std::numeric_limits<int>::max()));
+                    : arguments.has("error") && !arguments.given("samples")
+                        ? static_cast<uint32_t>(kMostForError)
+                        : static_cast<uint32_t>(samples);
     query.rate = arguments.get<float>("rate");
     const bool needsMajorant = freePaths || query.method == TRK_METHOD_DELTA;
     if (!(query.rate > 0) || !std::isfinite(query.rate) || (needsMajorant && query.rate < 1)) {
@@ -153,7 +271,7 @@ track::Query queryOf(const Arguments& arguments) {
     if (!(query.step >= 0.001f) || !std::isfinite(query.step)) {
         throw UsageError("--step: expected a finite number of voxels >= 0.001");
     }
-    query.flags &= arguments.flag("no-roulette") ? ~uint32_t{TRK_QUERY_ROULETTE} : ~uint32_t{0};
+    query.flags &= arguments.flag("roulette") ? ~uint32_t{0} : ~uint32_t{TRK_QUERY_ROULETTE};
     query.level = static_cast<uint32_t>(arguments.integer("level", 0, 64));
     query.seed = arguments.get<uint64_t>("seed");
     return query;
@@ -172,58 +290,122 @@ TrkVolumeOptions volumeOptionsOf(const Arguments& arguments) {
     return options;
 }
 
-/// Opens the density with the sidecar that the method needs.
-track::Volume openFor(const Arguments& arguments, const TrkQuery& query, TrkVolumeOptions options) {
-    const std::string input = arguments.text("IN.vdb");
-    const std::string sidecar = arguments.text("sidecar");
+/// What to open.
+struct Inputs {
+    std::string density;  ///< empty: the sidecar alone
+    const char* sidecar;  ///< as trkOpenVolume takes it
+    std::string sidecarPath;
+    TrkVolumeOptions options;
+};
+
+/// The density with the sidecar that the method needs, or a sidecar alone.
+Inputs inputsOf(const Arguments& arguments, const TrkQuery& query,
+                const TrkVolumeOptions& options) {
+    Inputs inputs{arguments.text("IN.vdb"), nullptr, arguments.text("sidecar"), options};
+    const bool densityAlone = query.method == TRK_METHOD_EXACT || query.method == TRK_METHOD_MARCH;
+    if (std::filesystem::exists(inputs.density) && trk::isSidecar(inputs.density)) {
+        if (query.method != TRK_METHOD_CONTROL) {
+            throw trk::Error(TRK_ERROR_NO_DENSITY,
+                             inputs.density +
+                                 ": is a sidecar; expected the density it was baked "
+                                 "from, or --method control");
+        }
+        if (arguments.has("sidecar")) {
+            throw UsageError("--sidecar: of no use, as " + inputs.density + " is one");
+        }
+        inputs.sidecarPath = inputs.density;
+        inputs.density.clear();
+    } else if (!arguments.has("sidecar")) {
+        inputs.sidecarPath = trk::defaultSidecarPath(inputs.density);
+    }
+    const bool sidecarThere =
+        std::filesystem::exists(inputs.sidecarPath) && trk::isSidecar(inputs.sidecarPath);
     // What needs no sidecar also must not fail over one that does not fit; but if the bake was
     // allowed to repair values, so is this.
-    const bool densityAlone = query.method == TRK_METHOD_EXACT || query.method == TRK_METHOD_MARCH;
     const bool useSidecar = !densityAlone || arguments.has("sidecar");
-    const std::string beside = trk::defaultSidecarPath(input);
-    if (!useSidecar && std::filesystem::exists(beside) && trk::isSidecar(beside)) {
-        options.repair |= trk::readSidecarHeader(beside).repair;
+    if (!useSidecar && sidecarThere) {
+        inputs.options.repair |= trk::readSidecarHeader(inputs.sidecarPath).repair;
     }
-    const std::string used = arguments.has("sidecar") ? sidecar : beside;
-    if (useSidecar && std::filesystem::exists(used) && trk::isSidecar(used)) {
-        const trk::SidecarHeader header = trk::readSidecarHeader(used);
-        checkLevel(used, query.level, header);
-        const bool constantOnly =
-            options.choice == TRK_CHOICE_MIN || options.choice == TRK_CHOICE_MAX;
-        if (constantOnly && options.global == 0 &&
+    if (useSidecar && sidecarThere) {
+        const trk::SidecarHeader header = trk::readSidecarHeader(inputs.sidecarPath);
+        checkLevel(inputs.sidecarPath, query.level, header);
+        const TrkChoice choice = inputs.options.choice;
+        const bool constantOnly = choice == TRK_CHOICE_MIN || choice == TRK_CHOICE_MAX;
+        if (constantOnly && inputs.options.global == 0 &&
             header.controlKind != trk::ControlKind::kConstant) {
-            throw UsageError("--choice " + arguments.text("choice") + ": the control of " + used +
-                             " is " + trk::controlName(header.controlKind) +
+            throw UsageError("--choice " + arguments.text("choice") + ": the control of " +
+                             inputs.sidecarPath + " is " + trk::controlName(header.controlKind) +
                              "; expected robust or mean, or --global");
         }
     }
-    return track::Volume::open(input,
-                               arguments.has("sidecar") ? sidecar.c_str()
-                               : useSidecar             ? nullptr
-                                                        : "",
-                               options);
+    inputs.sidecar = inputs.density.empty() || arguments.has("sidecar") ? inputs.sidecarPath.c_str()
+                     : useSidecar                                       ? nullptr
+                                                                        : "";
+    return inputs;
+}
+
+/// The volume as the library's inside knows it, which has formulas for its variance.
+trk::Volume openInside(const Inputs& inputs) {
+    trk::VolumeOptions options;
+    options.gridNamed = inputs.options.gridName != nullptr;
+    options.gridName = options.gridNamed ? inputs.options.gridName : "";
+    options.scale = inputs.options.scale;
+    std::copy_n(inputs.options.color, 3, options.color.begin());
+    options.choice = inputs.options.choice;
+    options.global = inputs.options.global != 0;
+    options.repair = inputs.options.repair;
+    trk::Volume volume = trk::openVolume(inputs.density.c_str(), inputs.sidecar, options);
+    trk::requireSuperVoxels(volume);
+    return volume;
+}
+
+std::string answerRays(const Arguments& arguments, const track::Query& query, const Inputs& inputs,
+                       const std::vector<TrkRay>& rays) {
+    const bool hasFormula = !arguments.flag("free-paths") && !arguments.flag("roulette") &&
+                            query.method != TRK_METHOD_EXACT &&
+                            query.method != TRK_METHOD_CONTROL && query.method != TRK_METHOD_MARCH;
+    if (hasFormula) {
+        return certainTransmittances(arguments, openInside(inputs), query, rays);
+    }
+    const track::Volume volume =
+        track::Volume::open(inputs.density, inputs.sidecar, inputs.options);
+    return arguments.flag("free-paths") ? freePaths(arguments, volume, query, rays)
+                                        : transmittances(arguments, volume, query, rays);
 }
 
 void run(const Command& command, const std::vector<std::string>& given) {
     po::options_description options("Options");
     options.add_options()("rays", po::value<std::string>(),
-                          "CSV file: ox,oy,oz,dx,dy,dz[,tmin,tmax] a line, world space")(
+                          "CSV file, or - for standard input: ox,oy,oz,dx,dy,dz[,tmin,tmax] a "
+                          "line, world space; a header "
+                          "may name the columns in another order")(
         "sidecar", po::value<std::string>(), "default: IN.track.vdb, where it exists")(
-        "method", po::value<std::string>()->default_value("residual"),
-        "exact: no noise, no bias, slowest; residual: residual ratio tracking, least noise of the "
-        "unbiased; ratio: ratio tracking; delta: delta tracking, 0 or 1; control: the control "
-        "alone, biased, no noise; march: ray marching, biased")(
+        "method", po::value<std::string>()->default_value("exact"),
+        "exact: no noise, no bias; random and unbiased, as a renderer would ask: residual "
+        "(residual "
+        "ratio tracking, least noise), ratio (ratio tracking), delta (delta tracking, 0 or 1); "
+        "biased: control (the control alone, no noise), march (ray marching)")(
         "free-paths", po::bool_switch(),
-        "sample where a photon collides instead, by --method residual (decomposition tracking) or "
-        "delta: ray,t,weight,extinction,lookups, t = inf where it escapes")(
-        "samples", po::value<int>()->default_value(16), "estimates averaged per ray")(
+        "sample where a photon collides instead, by --method residual (decomposition tracking, "
+        "default "
+        "here) or delta: ray,t,weight,extinction,lookups, t = inf where it escapes")(
+        "samples", po::value<int>()->default_value(64),
+        "of random methods: estimates averaged per ray; with --error at most (default then 2^20)")(
+        "error", po::value<float>(),
+        "of residual, ratio and delta: take as many samples of each ray as its standard error "
+        "needs, "
+        "found by formula before any is drawn, or integrate it exactly where that is cheaper (adds "
+        "a column: samples, 0 for exact)")(
         "rate", po::value<float>()->default_value(1.0f, "1"),
         "multiplies the sampling rate of residual and ratio; of delta and free paths the majorant "
         "(>= 1)")("rate-base", po::value<std::string>()->default_value("majorant"),
                   "what the rate of residual and ratio is a multiple of, per super-voxel: majorant "
                   "or rms (of the residual)")("step", po::value<float>()->default_value(1.0f, "1"),
                                               "of march: voxels between look-ups")(
-        "no-roulette", po::bool_switch(), "never end a walk early")(
+        "roulette", po::bool_switch(),
+        "end walks of residual and ratio early, without bias, as renderers do: then standard "
+        "errors "
+        "are those that the samples show, and empty where they show none")(
         "choice", po::value<std::string>()->default_value("robust"),
         "control of the residual method: robust, mean, min or max (the last two only where it was "
         "baked constant)")("global", po::bool_switch(),
@@ -233,7 +415,7 @@ void run(const Command& command, const std::vector<std::string>& given) {
         "seed", po::value<uint64_t>()->default_value(0), "of the random numbers")(
         "stream", po::value<uint64_t>()->default_value(0), "independent random numbers")(
         "scale", po::value<float>()->default_value(1.0f, "1"), "extinction = scale x density")(
-        "output,o", po::value<std::string>(), "CSV file to write; default: stdout")(
+        "output,o", po::value<std::string>(), "CSV file to write; - or default: stdout")(
         "force", po::bool_switch(), "replace an existing file");
     addColorOption(options);
     addGridOptions(options);
@@ -243,18 +425,20 @@ void run(const Command& command, const std::vector<std::string>& given) {
     }
     const track::Query query = queryOf(arguments);
     const TrkVolumeOptions volumeOptions = volumeOptionsOf(arguments);
-    refuseInput(arguments.text("output"),
+    const std::string output = arguments.text("output") == "-" ? "" : arguments.text("output");
+    refuseInput(output,
                 {arguments.text("IN.vdb"), arguments.text("rays"), arguments.text("sidecar")});
     const std::vector<TrkRay> rays = readRays(arguments.text("rays"));
-    const track::Volume volume = openFor(arguments, query, volumeOptions);
-    const std::string csv = arguments.flag("free-paths")
-                                ? freePaths(arguments, volume, query, rays)
-                                : transmittances(arguments, volume, query, rays);
-    if (!arguments.has("output")) {
+    if (rays.empty() && !arguments.quiet()) {
+        std::cerr << "vdbtrack: note: " << arguments.text("rays") << ": no rays\n";
+    }
+    const std::string csv =
+        answerRays(arguments, query, inputsOf(arguments, query, volumeOptions), rays);
+    if (output.empty()) {
         std::cout << csv;
         return;
     }
-    trk::OutputFile file(arguments.text("output"), arguments.flag("force"));
+    trk::OutputFile file(output, arguments.flag("force"));
     std::ofstream stream(file.path(), std::ios::binary);
     stream << csv;
     stream.close();
@@ -268,12 +452,14 @@ void run(const Command& command, const std::vector<std::string>& given) {
 
 const Command kQueryCommand{
     "query",
-    "vdbtrack query IN.vdb --rays RAYS.csv [--sidecar S] [--grid NAME] [--method residual] "
-    "[--free-paths] [--samples 16] [--rate 1] [--rate-base majorant] [--step 1] [--no-roulette] "
+    "vdbtrack query IN.vdb|SIDECAR --rays RAYS.csv [--sidecar S] [--grid NAME] [--method exact] "
+    "[--free-paths] [--samples 64 | --error E] [--rate 1] [--rate-base majorant] [--step 1] "
+    "[--roulette] "
     "[--choice robust] [--global] [--level 0] [--seed 0] [--stream 0] [--scale 1] "
     "[--color 1,1,1] [-o OUT.csv] [--force]",
     "Prints the transmittance of rays: ray,transmittance,stderr,optical_depth,lookups; in colour "
-    "with _r, _g, _b. With --free-paths, where photons collide.",
+    "with _r, _g, _b; empty where something is not known. With --free-paths, where photons "
+    "collide.",
     run};
 
 }  // namespace apps

@@ -31,6 +31,39 @@ double integrateGauss(double t0, double t1, const G& g) {
     return half * sum;
 }
 
+template <size_t C, class Method, class View>
+double rateOf(const View& v, const trk::TrackingSettings& settings) {
+    double rate = 0;
+    for (size_t c = 0; c < C; ++c) {
+        rate = std::max(rate, settings.rate * Method::rate(v, c, settings.rateBase));
+    }
+    return rate;
+}
+double expectedLookups(double rate, const trk::TrackingSettings& settings, double voxels) {
+    return rate * settings.lengthPerVoxel * voxels;
+}
+/// Beyond which a super-voxel is integrated exactly.
+double mostLookups(const trk::TrackingSettings& settings, const trk::LocalRay& ray, double voxels) {
+    return settings.exactFallback ? trk::exactCost(ray, voxels) : trk::kMostLookups;
+}
+
+template <class V, class Method>
+PredictedCost costOf(const Volume& volume, const TrkQuery& query, const trk::ClippedRay& clipped) {
+    const trk::TrackingSettings settings = trk::trackingSettings(query, clipped.lengthPerVoxel);
+    const trk::LocalRay& ray = clipped.local;
+    PredictedCost cost;
+    typename V::Walk{volume.tracked()}.walk(
+        ray, 0, ray.tEnd, [&](const auto& v, double t0, double t1) {
+            const double lookups =
+                expectedLookups(rateOf<V::kChannels, Method>(v, settings), settings, t1 - t0);
+            const bool tracked = lookups <= mostLookups(settings, ray, t1 - t0);
+            cost.estimate += tracked ? lookups : trk::exactCost(ray, t1 - t0);
+            cost.exact += trk::exactCost(ray, t1 - t0);
+            return true;
+        });
+    return cost;
+}
+
 /// Per channel, the integral of residual^2 / rate over what is tracked.
 template <class V, class Method>
 std::array<double, V::kChannels> integrateNoise(const Volume& volume, const TrkQuery& query,
@@ -42,13 +75,9 @@ std::array<double, V::kChannels> integrateNoise(const Volume& volume, const TrkQ
     const trk::LocalRay& ray = clipped.local;
     std::array<double, C> sum{};
     superVoxels.walk(ray, 0, ray.tEnd, [&](const auto& v, double t0, double t1) {
-        double rate = 0;
-        for (size_t c = 0; c < C; ++c) {
-            rate = std::max(rate, settings.rate * Method::rate(v, c, settings.rateBase));
-        }
-        const double expected = rate * settings.lengthPerVoxel * (t1 - t0);
-        if (rate == 0 || expected > (settings.exactFallback ? trk::exactCost(ray, t1 - t0)
-                                                            : trk::kMostLookups)) {
+        const double rate = rateOf<C, Method>(v, settings);
+        if (rate == 0 ||
+            expectedLookups(rate, settings, t1 - t0) > mostLookups(settings, ray, t1 - t0)) {
             return true;
         }
         const auto add = [&](double a, double b, bool empty) {
@@ -90,6 +119,12 @@ std::array<double, 3> predictVariance(const Volume& volume, const TrkQuery& quer
         return result;
     }
     const std::vector<double> depth = exactOpticalDepths(volume, {ray});
+    if (query.method == TRK_METHOD_DELTA) {
+        for (size_t c = 0; c < depth.size(); ++c) {
+            result[c] = -std::exp(-depth[c]) * std::expm1(-depth[c]);
+        }
+        return result;
+    }
     const bool residual = query.method == TRK_METHOD_RESIDUAL;
     trk::withVariant(
         volume, residual ? volume.tracked().kind() : ControlKind::kConstant, [&](auto variant) {
@@ -105,6 +140,20 @@ std::array<double, 3> predictVariance(const Volume& volume, const TrkQuery& quer
             }
         });
     return result;
+}
+
+PredictedCost predictCost(const Volume& volume, const TrkQuery& query, const TrkRay& ray) {
+    PredictedCost cost;
+    if (const auto clipped = volume.clip(ray, volume.field->box())) {
+        const bool residual = query.method == TRK_METHOD_RESIDUAL;
+        trk::withVariant(
+            volume, residual ? volume.tracked().kind() : ControlKind::kConstant, [&](auto variant) {
+                using V = decltype(variant);
+                cost = residual ? costOf<V, trk::ResidualControl>(volume, query, *clipped)
+                                : costOf<V, trk::NoControl>(volume, query, *clipped);
+            });
+    }
+    return cost;
 }
 
 }  // namespace vdbtools

@@ -178,6 +178,12 @@ Volume openVolume(const char* vdbPath, const char* sidecarPath, const VolumeOpti
     if (vdbPath == nullptr) {
         sidecar = readSidecar(path, nullptr, options.check);
         volume.grid = sidecar.header.source;
+        if (options.gridNamed && options.gridName != volume.grid.name &&
+            options.gridName != volume.grid.name + "[" + std::to_string(volume.grid.index) + "]") {
+            throw Error(TRK_ERROR_GRID_NOT_FOUND, path + ": no grid \"" + options.gridName +
+                                                      "\"; it was baked from grid " +
+                                                      volume.grid.name);
+        }
         volume.indexToWorld = sidecar.header.indexToWorld;
         volume.worldToIndex = volume.indexToWorld.inverse();
         volume.anchor = sidecar.anchor;

@@ -92,9 +92,10 @@ case_usage() {
     usage "--voxels 3" make x.vdb --voxels 3
     usage "missing --rays" query cloud.vdb
     usage "--method magic" query cloud.vdb --rays r.csv --method magic
-    usage "--choice best" query cloud.vdb --rays r.csv --choice best
-    usage "--samples 0" query cloud.vdb --rays r.csv --samples 0
-    usage "--rate" query cloud.vdb --rays r.csv --rate 0
+    usage "--choice best" query cloud.vdb --rays r.csv --method residual --choice best
+    usage "--samples 0" query cloud.vdb --rays r.csv --method ratio --samples 0
+    usage "--error" query cloud.vdb --rays r.csv --method ratio --error 0
+    usage "--rate" query cloud.vdb --rays r.csv --method ratio --rate 0
     usage "--scale" query cloud.vdb --rays r.csv --scale -1
     usage "--scale" query cloud.vdb --rays r.csv --scale nan
     usage "--resolution 0x5" preview x --resolution 0x5
@@ -158,7 +159,7 @@ case_colour() {
         awk -F, 'NR == 2 && !($2 < 1 && $3 < 1 && $2 != $3) { exit 1 }' stdout ||
             fail "channels that should differ: $(cat stdout)"
         cp stdout exact.csv
-        expect 0 query color.vdb --rays rays.csv --samples 4000 --color 1,0.5,0
+        expect 0 query color.vdb --rays rays.csv --method residual --samples 4000 --color 1,0.5,0
         paste -d, exact.csv stdout | awk -F, 'NR > 1 {
             for (c = 2; c <= 4; ++c) {
                 d = $c - $(c + 11); if (d < 0) d = -d
@@ -170,7 +171,7 @@ case_colour() {
     done
     small_cloud
     expect 0 bake cloud.vdb --size 8 --control affine
-    expect 2 query cloud.vdb --rays rays.csv --choice max
+    expect 2 query cloud.vdb --rays rays.csv --method residual --choice max
     contains stderr "--choice max: the control of cloud.track.vdb is affine"
     expect 0 query cloud.vdb --rays rays.csv --color 2,2,2
     [ "$(head -n 1 stdout)" = "ray,transmittance,stderr,optical_depth,lookups" ] ||
@@ -245,12 +246,12 @@ case_query_output() {
         fail "exact rows: $(cat stdout)"
     cp stdout exact.csv
     for method in "residual --choice robust" "residual --choice mean" "residual --choice min" \
-        "residual --choice max" "residual --rate-base rms --rate 3" "residual --no-roulette" \
+        "residual --choice max" "residual --rate-base rms --rate 3" "residual --roulette" \
         ratio "ratio --global" "residual --global" "ratio --rate-base rms --rate 2" \
-        delta "delta --global --rate 2" "march --step 0.05"; do
+        delta "delta --global --rate 2"; do
             # shellcheck disable=SC2086
             expect 0 query cloud.vdb --rays rays.csv --method $method --samples 4000
-            # Within 5 standard errors of the exact value (two misses have an error of 0).
+            # Within 5 standard errors of the exact value (a miss has an error of 0).
             paste -d, exact.csv stdout | awk -F, 'NR > 1 {
                 d = $2 - $7; if (d < 0) d = -d
                 if (d > 5 * $8 + 1e-6 || $9 != "") { print; exit 1 } }' >bad ||
@@ -258,18 +259,48 @@ case_query_output() {
     done
     expect 0 query cloud.vdb --rays rays.csv --method delta --samples 1
     awk -F, 'NR > 1 && $2 != 0 && $2 != 1 { exit 1 }' stdout || fail "delta: $(cat stdout)"
-    expect 0 query cloud.vdb --rays rays.csv --samples 1
-    awk -F, 'NR > 1 && ($3 != "" || $4 != "") { exit 1 }' stdout || fail "one sample: $(cat stdout)"
+    # What is not known is empty, and said to be.
+    expect 0 query cloud.vdb --rays rays.csv --method residual --roulette --samples 1
+    awk -F, 'NR == 2 && ($3 != "" || $4 != "") { exit 1 }' stdout || fail "one sample: $(cat stdout)"
+    contains stderr "have no standard error: with --roulette, one sample shows none"
+    expect 0 query cloud.vdb --rays rays.csv --method ratio --roulette --samples 16 --scale 1000
+    [ "$(sed -n 2p stdout | cut -d, -f2,3)" = "0," ] || fail "nothing came through: $(sed -n 2p stdout)"
+    contains stderr "no sample got through"
+    contains stderr "T < 0.17 at 95 %"
+    for method in control march; do
+        expect 0 query cloud.vdb --rays rays.csv --method $method
+        awk -F, 'NR == 2 && $3 != "" { exit 1 }' stdout || fail "$method: $(cat stdout)"
+        contains stderr "$method is biased"
+        expect 0 query cloud.vdb --rays rays.csv --method $method --quiet
+        [ ! -s stderr ] || fail "--quiet: $(cat stderr)"
+    done
+    expect 0 query cloud.vdb --rays rays.csv --method march --step 0.05
+    paste -d, exact.csv stdout | awk -F, 'NR > 1 { d = $2 - $7; if (d < 0) d = -d
+        if (d > 1e-3) { print; exit 1 } }' >bad || fail "march: $(cat bad)"
+    # As many samples as an error needs, or none where exact integration is cheaper.
+    expect 0 query cloud.vdb --rays rays.csv --method residual --error 0.2 --scale 0.3
+    [ "$(head -n 1 stdout)" = "ray,transmittance,stderr,optical_depth,lookups,samples" ] || fail "header"
+    awk -F, 'NR == 2 && !($3 > 0 && $3 <= 0.2 && $6 > 0) { exit 1 }' stdout || fail "--error: $(cat stdout)"
+    expect 0 query cloud.vdb --rays rays.csv --method residual --error 1e-5
+    awk -F, 'NR == 2 && !($3 == 0 && $6 == 0 && $4 > 0) { exit 1 }' stdout || fail "exact: $(cat stdout)"
     expect 0 query cloud.vdb --rays rays.csv --method control --level 2
-    expect 0 query cloud.vdb --rays rays.csv -o out.csv
+    # The sidecar alone knows its control.
+    cp stdout level2.csv
+    mv cloud.vdb away.vdb
+    expect 0 query cloud.track.vdb --rays rays.csv --method control --level 2
+    cmp -s stdout level2.csv || fail "the sidecar alone answers otherwise"
+    expect 1 query cloud.track.vdb --rays rays.csv
+    one_line "is a sidecar; expected the density"
+    mv away.vdb cloud.vdb
+    expect 0 query cloud.vdb --rays rays.csv --method residual -o out.csv
     [ ! -s stdout ] || fail "-o writes to stdout too"
-    expect 0 query cloud.vdb --rays rays.csv
+    "$vdbtrack" query cloud.vdb --rays - --method residual -o - <rays.csv >stdout 2>stderr || fail "pipes"
     cmp -s stdout out.csv || fail "-o and stdout differ"
-    expect 0 query cloud.vdb --rays rays.csv --threads 1
+    expect 0 query cloud.vdb --rays rays.csv --method residual --threads 1
     cmp -s stdout out.csv || fail "one thread, other results"
-    expect 0 query cloud.vdb --rays rays.csv --seed 7
+    expect 0 query cloud.vdb --rays rays.csv --method residual --seed 7
     cmp -s stdout out.csv && fail "another seed, the same results"
-    expect 0 query cloud.vdb --rays rays.csv --stream 7
+    expect 0 query cloud.vdb --rays rays.csv --method residual --stream 7
     cmp -s stdout out.csv && fail "another stream, the same results"
     expect 0 query cloud.vdb --rays rays.csv --scale 0
     awk -F, 'NR > 1 && $2 != 1 { exit 1 }' stdout || fail "scale 0: $(cat stdout)"
@@ -303,13 +334,17 @@ case_free_paths() {
     wrong "--level: of no use with --method ratio" --method ratio --level 1
     wrong "--step: of no use with --method exact" --method exact --step 2
     wrong "--step: expected a finite number of voxels" --method march --step 0
+    wrong "--samples: of no use with --method exact" --samples 4
+    wrong "--seed: of no use with --method control" --method control --seed 4
+    wrong "--error: of no use with --method march" --method march --error 0.1
+    wrong "--error and --roulette" --method ratio --error 0.1 --roulette
     wrong "--rate-base: of no use with --method delta" --method delta --rate-base rms
     wrong "--rate: of no use with --method march" --method march --rate 2
     wrong "--global: of no use with --method control" --method control --global
     wrong "--choice: of no use with --method ratio" --method ratio --choice min
     wrong "--choice: of no use with --free-paths" --free-paths --choice mean
-    wrong "--no-roulette: of no use with --method delta" --method delta --no-roulette
-    wrong "rate-base" --rate-base loudest
+    wrong "--roulette: of no use with --method delta" --method delta --roulette
+    wrong "rate-base" --method ratio --rate-base loudest
 }
 
 case_bad_rays() {
@@ -319,13 +354,28 @@ case_bad_rays() {
     : >empty.csv
     expect 0 query cloud.vdb --rays empty.csv
     [ "$(cat stdout)" = "ray,transmittance,stderr,optical_depth,lookups" ] || fail "header alone"
+    contains stderr "empty.csv: no rays"
     bad() {
         printf '%b' "$1" >bad.csv
         expect 1 query cloud.vdb --rays bad.csv
         one_line "$2"
     }
     bad '0,0,0,1,0,0\n0,0,0,1,0\n' "bad.csv: line 2: expected ox,oy,oz,dx,dy,dz[,tmin,tmax], found 5"
-    bad 'a,b,c,d,e,f\nx,0,0,1,0,0\n' "line 2"
+    bad 'a,b,c,d,e,f\n0,0,0,1,0,0\n' 'line 1: expected numbers, or a header'
+    bad 'O,0,0,1,0,0\n0,0,0,1,0,0\n' 'line 1: expected numbers, or a header'
+    bad 'ox,oy,oz,dx,dy,dx\n0,0,0,1,0,0\n' "line 1: expected every column once, found dx twice"
+    bad 'ox,oy,oz,dx,dy\n0,0,0,1,0\n' "none named dz"
+    bad 'ox,oy,oz,dx,dy,dz,tmin\n0,0,0,1,0,0,0\n' "none named tmax"
+    bad 'ox,oy,oz,dx,dy,dz\nx,0,0,1,0,0\n' 'line 2: expected 6 numbers, as the header names, found "x,0,0,1,0,0"'
+    bad 'ox,oy,oz,dx,dy,dz\n0,0,0,1,0,0,0,1\n' "found 8 numbers"
+    bad '0,0,0,1,0,0,2,1\n' "line 1: expected tmin <= tmax, found tmin 2 and tmax 1"
+    # A header's order counts.
+    printf 'ox,oy,oz,dx,dy,dz\n-5,4,5,1,0.02,0.01\n' >straight.csv
+    printf '# mine\ndx, dy,dz ,ox,oy,oz\r1,0.02,0.01,-5,4,5\r' >turned.csv
+    expect 0 query cloud.vdb --rays straight.csv
+    cp stdout straight.out
+    expect 0 query cloud.vdb --rays turned.csv
+    cmp -s stdout straight.out || fail "columns in another order: $(cat stdout)"
     bad '0,0,0,1,0,0,5\n' "found 7 numbers"
     bad '0,0,0,1,0,zero\n' "line 1"
     bad '0,0,0,1,0,0\n\n# fine\n0,0,0,0,0,0\n' "line 4: expected a finite origin"
@@ -374,9 +424,9 @@ case_bad_files() {
     one_line 'no grid "heat"; the file has density'
     absent heat.track.vdb
     rm cloud.track.vdb
-    expect 1 query cloud.vdb --rays rays.csv
+    expect 1 query cloud.vdb --rays rays.csv --method residual
     one_line "vdbtrack bake"
-    expect 0 query cloud.vdb --rays rays.csv --method exact
+    expect 0 query cloud.vdb --rays rays.csv
     expect 1 verify cloud.vdb
     one_line "cloud.track.vdb"
 }

@@ -104,7 +104,7 @@ TEST(Coverage, OfThreePrintedErrorsIsNinetyNineInAHundred) {
                                3 * error + 1e-6 * scene.exact[i] + 1e-30;
                     };
                     outside[i] = isOutside(found);
-                    outsideIfOff[i] = isOutside(found + 5 * error);
+                    outsideIfOff[i] = error == 0 || isOutside(found + 5 * error);
                 });
                 const auto share = [&](const std::vector<char>& flags) {
                     return static_cast<double>(std::count(flags.begin(), flags.end(), 1)) /
@@ -115,7 +115,7 @@ TEST(Coverage, OfThreePrintedErrorsIsNinetyNineInAHundred) {
                             outside.size());
                 const double allowed = fixtures::kSanitized ? 0.03 : 0.01;
                 EXPECT_LE(share(outside), allowed) << grid.label << " " << depth << " " << method;
-                EXPECT_GT(share(outsideIfOff), 0.5);  // what is off by five of them is seen
+                EXPECT_GT(share(outsideIfOff), 0.7);  // what is off by five of them is seen
             }
         }
     }
@@ -160,7 +160,7 @@ size_t falselyCertain(const track::Volume& volume, const Scene& scene, track::Qu
     size_t count = 0;
     for (size_t i = 0; i < found.size(); ++i) {
         const double off = std::fabs(static_cast<double>(found[i]) - scene.exact[i]);
-        count += statistics.standardError[i] == 0 && off > 1e-5 * scene.exact[i] ? 1 : 0;
+        count += statistics.standardError[i] == 0 && off > 1e-5 * scene.exact[i] + 1e-38 ? 1 : 0;
     }
     return count;
 }

@@ -262,6 +262,20 @@ TEST(LoadDensity, RefusesForeignAndDamagedFiles) {
     expectFailure(writeBytes("newer.vdb", newer), TRK_ERROR_BAD_FILE, "version");
 }
 
+std::string bytesOf(const std::string& path) {
+    std::ifstream stream(path, std::ios::binary);
+    return {std::istreambuf_iterator<char>(stream), std::istreambuf_iterator<char>()};
+}
+
+/// The file as if version `version`, of OpenVDB `major`, had been written. (No real writer's file
+/// of version 225 was at hand; its floats, doubles and vectors are laid out as 224's.)
+std::string asVersion(std::string bytes, uint32_t version, uint32_t major, const char* name) {
+    std::memcpy(&bytes[8], &version, sizeof(version));
+    std::memcpy(&bytes[12], &major, sizeof(major));
+    std::ofstream(fixtures::path(name), std::ios::binary) << bytes;
+    return fixtures::path(name);
+}
+
 /// The blob with noise that no codec compresses, so that its chunks are stored as they are.
 std::string noisyFile(const char* name) {
     std::mt19937 random(5);
@@ -357,6 +371,31 @@ TEST(LoadDensity, EmptyGridsAreEmptyFields) {
     const trk::Density d = fixtures::load(fixtures::write("void.vdb", {grid}));
     EXPECT_TRUE(d.field.box().empty());
     EXPECT_EQ(densityAt(d, 0, 0, 0), 0.0f);
+}
+
+TEST(LoadDensity, ReadsFilesOfVersion225) {
+    auto doubles = openvdb::DoubleGrid::create();
+    doubles->setName("density");
+    doubles->tree().setValueOn(Coord(1, 2, 3), 0.5);
+    const openvdb::GridCPtrVec kinds[] = {{fixtures::makeBlob(40)}, {doubles}, {noisyColor()}};
+    for (const openvdb::GridCPtrVec& grids : kinds) {
+        const std::string old = fixtures::write("224.vdb", grids);
+        testing::internal::CaptureStderr();
+        const trk::Density expected = fixtures::load(old);
+        const trk::Density found = fixtures::load(asVersion(bytesOf(old), 225, 13, "225.vdb"));
+        EXPECT_EQ(testing::internal::GetCapturedStderr(), "");  // OpenVDB would warn
+        EXPECT_EQ(found.summary.digest, expected.summary.digest);
+        EXPECT_EQ(found.summary.activeVoxels, expected.summary.activeVoxels);
+        EXPECT_EQ(found.field.brickCount(), expected.field.brickCount());
+    }
+    const std::string bytes = bytesOf(fixtures::write("224.vdb", {fixtures::makeBlob(40)}));
+    expectFailure(asVersion(bytes, 226, 14, "226.vdb"), TRK_ERROR_BAD_FILE,
+                  "version 226, written by OpenVDB 14.");
+    std::string half = bytes;
+    const std::string name("\x10\0\0\0Tree_float_5_4_3", 20);
+    half.replace(half.find(name), name.size(), std::string("\x0f\0\0\0Tree_half_5_4_3", 19));
+    expectFailure(asVersion(half, 225, 13, "half.vdb"), TRK_ERROR_UNSUPPORTED_GRID,
+                  "native halfs, which OpenVDB 13 writes");
 }
 
 }  // namespace

@@ -73,6 +73,9 @@ void checkKind(const VdbEntry& entry, const openvdb::GridBase* grid, const std::
             where + ": is " + found + "; expected a fog volume of float, double, vec3s or vec3d");
     };
     const std::string valueType = valueTypeName(entry.type);
+    if (valueType == "half") {
+        refuse("of native halfs, which OpenVDB 13 writes (file version 225)");
+    }
     if (!grid || channelCount(valueType) == 0) {
         refuse("of type " + valueType);
     }

@@ -42,8 +42,18 @@ class GuardedFileBuf : public std::filebuf {
         expected_ = chunkSize_ = kNothing;
     }
 
+    /// Has whoever reads the file's version find `version`, if the file's is another.
+    void showVersion(uint32_t version) { shownVersion_ = version; }
+
   protected:
     std::streamsize xsgetn(char* out, std::streamsize size) override {
+        if (shownVersion_ != 0 && size == sizeof(shownVersion_) &&
+            seekoff(0, std::ios::cur, std::ios::in) == kVersionPlace) {
+            const std::streamsize got = std::filebuf::xsgetn(out, size);
+            std::memcpy(out, &shownVersion_, static_cast<size_t>(got));
+            shownVersion_ = 0;
+            return got;
+        }
         if (codec_ == Codec::kUnguarded) {
             return std::filebuf::xsgetn(out, size);
         }
@@ -66,6 +76,7 @@ class GuardedFileBuf : public std::filebuf {
     }
 
   private:
+    static constexpr std::streamoff kVersionPlace = 8;  // behind the magic number
     static constexpr std::streamsize kNothing = std::numeric_limits<std::streamsize>::min();
     static constexpr char kAllValues = 6;  // OpenVDB's NO_MASK_AND_ALL_VALS
 
@@ -119,6 +130,7 @@ class GuardedFileBuf : public std::filebuf {
         afterMask_ = false;
     }
 
+    uint32_t shownVersion_ = 0;
     Codec codec_ = Codec::kUnguarded;
     Values values_;
     bool maskCompressed_ = false;

@@ -9,6 +9,7 @@
 #include <openvdb/io/GridDescriptor.h>
 #include <openvdb/io/io.h>
 
+#include <algorithm>
 #include <cerrno>
 #include <cstring>
 #include <filesystem>
@@ -71,6 +72,8 @@ std::string guessFormat(const std::string& head) {
     return "it looks like text";
 }
 
+// Of OpenVDB 13. It added grids of native halfs; all others are as in 224.
+constexpr uint32_t kNewestVersion = 225;
 constexpr uint32_t kOldestVersion = openvdb::OPENVDB_FILE_VERSION_BOOST_UUID;
 constexpr uint32_t kMaxName = 1u << 16;
 
@@ -164,7 +167,7 @@ class VdbFile::Archive : public openvdb::io::Archive {
 
   private:
     void checkMagic(const std::string& path) {
-        std::string head(16, '\0');
+        std::string head(20, '\0');
         stream_.read(head.data(), static_cast<std::streamsize>(head.size()));
         head.resize(static_cast<size_t>(stream_.gcount()));
         if (stream_.bad()) {
@@ -178,11 +181,18 @@ class VdbFile::Archive : public openvdb::io::Archive {
         if (head.size() >= sizeof(magic) + sizeof(version)) {
             std::memcpy(&version, head.data() + sizeof(magic), sizeof(version));
         }
-        // OpenVDB only warns of a newer version, then parses on.
+        // OpenVDB only warns of a newer version than its own, then parses on.
+        if (version > kNewestVersion) {
+            uint32_t writer[2] = {0, 0};
+            std::memcpy(writer, head.data() + sizeof(magic) + sizeof(version),
+                        std::min(sizeof(writer), head.size() - sizeof(magic) - sizeof(version)));
+            badFile(path, "VDB file version " + std::to_string(version) + ", written by OpenVDB " +
+                              std::to_string(writer[0]) + "." + std::to_string(writer[1]) +
+                              "; this build reads up to " + std::to_string(kNewestVersion) +
+                              " (OpenVDB 13); save it with an older OpenVDB");
+        }
         if (version > openvdb::OPENVDB_FILE_VERSION) {
-            badFile(path, "VDB file version " + std::to_string(version) +
-                              "; this build reads up to " +
-                              std::to_string(openvdb::OPENVDB_FILE_VERSION));
+            buffer_.showVersion(openvdb::OPENVDB_FILE_VERSION);
         }
         if (version < kOldestVersion) {
             badFile(path, "VDB file version " + std::to_string(version) + "; expected at least " +

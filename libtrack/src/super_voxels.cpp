@@ -11,6 +11,10 @@ namespace {
 /// Of the bound. See rateAtLeast.
 constexpr float kLeastRate = 0.25f;
 
+/// By what part of the largest value around it a look-up may leave the range of its corners: three
+/// interpolations in float, each of which rounds twice. Bounds cover what look-ups return.
+constexpr double kLookupRounding = 4e-7;
+
 /// How far a control may exceed the extinction. [Novak14, Eq. 6]: about D S collisions are
 /// expected, each amplifies by at most 1 + (control - extinction) / S; the formula caps their
 /// product at gamma = 2.
@@ -122,8 +126,9 @@ SuperVoxels::SuperVoxels(BakedVolume baked, const std::vector<double>& scales, T
         SuperVoxel v;
         ExtinctionRange range;
         v.baked = static_cast<float>(s * control.centre);
-        range.min = roundDown(min);
-        range.max = roundUp(max);
+        const double lookupRounding = kLookupRounding * max;
+        range.min = roundDown(std::max(min - lookupRounding, 0.0));
+        range.max = roundUp(max + lookupRounding);
         double share = 1;
         double residualRms = 0;
         if (item.min == item.max) {
@@ -133,14 +138,14 @@ SuperVoxels::SuperVoxels(BakedVolume baked, const std::vector<double>& scales, T
         } else if (kind_ == ControlKind::kConstant) {
             v.control = static_cast<float>(chooseControl(choice, min, mean, max, diagonal));
             const auto chosen = static_cast<double>(v.control);
-            v.bound = roundUp(std::max(chosen - min, max - chosen));
+            v.bound = roundUp(std::max(chosen - min, max - chosen) + lookupRounding);
             residualRms = std::hypot(deviation, chosen - mean);
         } else {
             const double excess = std::min(majorant, s * control.max() - min);
             share = chooseShare(choice, min, max, excess, diagonal);
             v.control = static_cast<float>(min + share * (s * control.centre - min));
-            // What is looked up, and the coefficients of the control, are floats.
-            const double rounding = 4e-7 * (max + s * control.max());
+            // The coefficients of the control are floats too.
+            const double rounding = lookupRounding + kLookupRounding * s * control.max();
             v.bound = roundUp(share * majorant + (1 - share) * (max - min) + rounding);
             // residual = share (extinction - baked control) + (1 - share) (extinction - min)
             residualRms = share * s * static_cast<double>(item.rms) +

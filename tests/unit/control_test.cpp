@@ -361,6 +361,50 @@ TEST(Control, BoundsHoldForEveryChoiceKindAndChannel) {
     }
 }
 
+// Look-ups interpolate in float, and leave the range of their corners by its rounding.
+TEST(Control, BoundsOfConstantControlsCoverWhatLookUpsReturn) {
+    std::mt19937_64 random(11);
+    std::uniform_real_distribution<float> value(1e-3f, 1.7f);
+    // One largest value, looked up next to it from others: their difference has been rounded.
+    const auto grid = fixtures::makeGrid(CoordBBox(Coord(0), Coord(47)), [&](const Coord&) {
+        const float v = value(random);
+        return v > 1 ? 1.7f : v;
+    });
+    const std::string vdb = fixtures::write("adversarial.vdb", {grid});
+    const trk::Density density = fixtures::load(vdb);
+    const trk::BakedVolume baked = vdbtools::bake(density.field, fixtures::bakeOptions(4, 0));
+    size_t outside = 0;  // of what was baked, which is of the corners
+    for (const TrkChoice choice :
+         {TRK_CHOICE_ROBUST, TRK_CHOICE_MEAN, TRK_CHOICE_MIN, TRK_CHOICE_MAX}) {
+        const trk::Volume volume = openWith(vdb, ControlKind::kConstant, 4, choice, 1);
+        using V = trk::Variant<1, 1, ControlKind::kConstant>;
+        const V::Extinction field(volume);
+        std::uniform_int_distribution<int> voxel(0, 46);
+        std::uniform_int_distribution<int> bits(18, 40);
+        for (int i = 0; i < 200000; ++i) {
+            Vec3d p;
+            for (int a = 0; a < 3; ++a) {
+                p[a] = voxel(random) - static_cast<double>(volume.anchor[static_cast<size_t>(a)]) +
+                       1 - std::ldexp(1.0, -bits(random));
+            }
+            const trk::LocalRay ray{p, {{1, 0, 0}}, {{1, 1e300, 1e300}}, 1e-9};
+            const double mu = field.extinction(p)[0];
+            V::Walk{volume.superVoxels}.walk(ray, 0, 1e-9, [&](const auto& v, double, double) {
+                EXPECT_GE(mu, static_cast<double>(v.range(0).min));
+                EXPECT_LE(mu, static_cast<double>(v.range(0).max));
+                EXPECT_LE(std::fabs(mu - v.control(0, p)), static_cast<double>(v[0].bound));
+                return false;
+            });
+            const auto found = baked.table.find(
+                static_cast<int64_t>(p[0]), static_cast<int64_t>(p[1]), static_cast<int64_t>(p[2]));
+            const auto& item = baked.items[trk::SparseTable::index(found.entry)];
+            outside +=
+                mu < static_cast<double>(item.min) || mu > static_cast<double>(item.max) ? 1 : 0;
+        }
+    }
+    EXPECT_GT(outside, 100u);
+}
+
 TEST(Control, RobustKeepsWhatIsThinAndTakesTheMinimumOfWhatIsThick) {
     using trk::SuperVoxels;
     // At most ln 2 collisions in which the control exceeds the extinction by all of the range.

@@ -45,8 +45,9 @@ void run(const Command& command, const std::vector<std::string>& given) {
         "control extinction of a super-voxel: constant (its mean), affine (mean and gradient) or "
         "trilinear (interpolated between corners, continuous)")(
         "levels", po::value<int>()->default_value(4),
-        "preview levels, each of super-voxels twice as large, 0 to 8")(
-        "force", po::bool_switch(), "replace an existing sidecar");
+        "preview levels at most, 0 to 8, each of super-voxels twice as large, until two an axis "
+        "hold "
+        "everything")("force", po::bool_switch(), "replace an existing sidecar");
     addGridOptions(options);
     const Arguments arguments(command, given, options, {"IN.vdb"}, 1);
 
@@ -82,28 +83,31 @@ void run(const Command& command, const std::vector<std::string>& given) {
     trk::OutputFile file(output, arguments.flag("force"));
     const trk::DensitySummary& summary = density.summary;
     trk::BakedVolume baked;
+    trk::SidecarHeader header;
     {
         const Progress progress(arguments, "baking " + input);
+        bakeOptions.sidecarBytes = vdbtools::sidecarLimit(summary.fileBytes);
         baked = vdbtools::bake(density.field, bakeOptions);
+        header = vdbtools::sidecarHeader(summary, density.field, baked);
     }
     const double bakeTime = seconds() - readTime;
     {
         const Progress progress(arguments, "writing " + output);
-        trk::writeSidecar(file, vdbtools::sidecarHeader(summary, bakeOptions), baked,
-                          summary.anchor);
+        trk::writeSidecar(file, header, baked, summary.anchor);
         file.commit();
     }
     if (baked.items.empty() && !arguments.quiet()) {
-        std::cerr << "vdbtrack: warning: " << input << ": grid " << summary.grid.name
+        std::cerr << "vdbtrack: warning: " << input << ": grid " << summary.label
                   << " is empty; its sidecar holds nothing and its transmittance is 1\n";
     }
     if (!arguments.quiet()) {
         warnOfBadFit(output, baked);
     }
     if (!arguments.quiet()) {
-        std::cerr << output << ": " << baked.table.occupiedItems() << " super-voxels of " << size
-                  << "^3 voxels, " << levels << " levels, "
-                  << byteCount(std::filesystem::file_size(output));
+        std::cerr << output << ": grid " << summary.label << ", " << baked.table.occupiedItems()
+                  << " super-voxels of " << size << "^3 voxels, " << baked.levels.size()
+                  << (baked.levels.size() == 1 ? " level, " : " levels, ") << "preview scale "
+                  << header.previewScale << ", " << byteCount(std::filesystem::file_size(output));
         if (summary.dropped + summary.clamped > 0) {
             std::cerr << "; " << summary.dropped << " values that were not finite and "
                       << summary.clamped << " negative ones read as 0";

@@ -20,6 +20,8 @@ namespace po = boost::program_options;
 
 namespace {
 
+tbb::global_control* threadLimit = nullptr;
+
 std::mutex progressMutex;
 
 }  // namespace
@@ -65,9 +67,8 @@ Arguments::Arguments(const Command& command, const std::vector<std::string>& arg
     if (threads > 0) {
         // TBB obeys this for as long as it lives, and where it dies starts the threads it was kept
         // from starting: it never does.
-        static const auto* const limit = new tbb::global_control(
-            tbb::global_control::max_allowed_parallelism, static_cast<size_t>(threads));
-        static_cast<void>(limit);
+        threadLimit = new tbb::global_control(tbb::global_control::max_allowed_parallelism,
+                                              static_cast<size_t>(threads));
     }
 }
 

@@ -173,8 +173,9 @@ void addScattering(const Arguments& arguments, const std::string& input, Scatter
     const vdbtools::BakeOptions bakeOptions = bakeForScattering(report.sweep);
     // Has no name: it goes when this ends.
     const trk::OutputFile sidecar(trk::temporaryFolder() + "/scattering.track.vdb", true);
-    trk::writeSidecar(sidecar, vdbtools::sidecarHeader(source.summary, bakeOptions),
-                      vdbtools::bake(*source.field, bakeOptions), source.summary.anchor);
+    const trk::BakedVolume baked = vdbtools::bake(*source.field, bakeOptions);
+    trk::writeSidecar(sidecar, vdbtools::sidecarHeader(source.summary, *source.field, baked), baked,
+                      source.summary.anchor);
     options.vdb = input;
     options.sidecar = sidecar.path();
     options.grid = arguments.text("grid");

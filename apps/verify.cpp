@@ -31,7 +31,8 @@ void run(const Command& command, const std::vector<std::string>& given) {
         densityOptions.repair |= trk::readSidecarHeader(path).repair;
     }
     const trk::DensitySummary summary = trk::loadDensity(input, densityOptions).summary;
-    const trk::Sidecar sidecar = trk::readSidecar(path, &summary, TRK_CHECK_FULL);
+    const trk::Sidecar sidecar =
+        trk::readSidecar(path, &summary, TRK_CHECK_FULL, trk::SidecarParts::kAll);
     const vdbtools::VerifyReport report = vdbtools::verify(summary, sidecar);
     if (!report.holds) {
         throw trk::Error(TRK_ERROR_SIDECAR_MISMATCH, path + ": " + report.counterexample);

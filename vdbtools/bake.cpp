@@ -5,6 +5,7 @@
 #include "levels.h"
 #include "moments.h"
 #include "parallel.h"
+#include "preview_scale.h"
 
 #include <algorithm>
 #include <cmath>
@@ -48,13 +49,11 @@ class Baker {
     BakedVolume bake() {
         planSuperVoxels();
         moments_.resize(jobs_.size() * channels_);
-        corners_.resize(kind_ == ControlKind::kConstant ? 0 : moments_.size());
+        corners_.resize(moments_.size());
         forEach(jobs_.size(), [&](size_t i) {
             for (size_t c = 0; c < channels_; ++c) {
                 moments_[i * channels_ + c] = momentsOf(jobs_[i], c);
-                if (kind_ != ControlKind::kConstant) {
-                    corners_[i * channels_ + c] = cornersOf(jobs_[i], c);
-                }
+                corners_[i * channels_ + c] = cornersOf(jobs_[i], c);
             }
         });
         baked_.superVoxelShift = shift_;
@@ -88,7 +87,7 @@ class Baker {
         const size_t perAxis = 8 / edge;
         const size_t cubesPerBrick = perAxis * perAxis * perAxis;
         cubes_.resize(field_.brickCount() * cubesPerBrick * channels_);
-        cubeCorners_.resize(kind_ == ControlKind::kConstant ? 0 : cubes_.size());
+        cubeCorners_.resize(cubes_.size());
         forEach(field_.brickCount(), [&](size_t b) {
             float vertices[ExtinctionField::kBrickVertices];
             for (size_t c = 0; c < channels_; ++c) {
@@ -102,9 +101,7 @@ class Baker {
                     const BrickChannel brick{BrickChannel{vertices}.row(x, y) + z};
                     const size_t cube = (b * cubesPerBrick + k) * channels_ + c;
                     cubes_[cube] = cubeMoments(brick, edge);
-                    if (kind_ != ControlKind::kConstant) {
-                        cubeCorners_[cube] = cornerMoments(brick, edge);
-                    }
+                    cubeCorners_[cube] = cornerMoments(brick, edge);
                 }
             }
         });
@@ -248,16 +245,29 @@ class Baker {
             }
             itemJobs_.push_back(i);
             itemOf[i] = static_cast<Entry>(itemJobs_.size());
+            addGradients(i);
             if (kind_ == ControlKind::kAffine) {
                 for (size_t c = 0; c < channels_; ++c) {
-                    const auto mean = static_cast<double>(meanOf(moments(i, c)));
-                    const auto gradient = fitGradient(corners_[i * channels_ + c], mean, size_);
+                    const auto gradient = trk::constrainGradient(
+                        &baked_.gradients[baked_.gradients.size() - 3 * (channels_ - c)],
+                        static_cast<double>(meanOf(moments(i, c))), size_);
                     baked_.shapes.insert(baked_.shapes.end(), gradient.begin(), gradient.end());
                 }
                 itemOf[i] |= isHomogeneous(i) ? 0 : SparseTable::kSingleFlag;
             }
         }
         baked_.table = plan_.mapped([&](Entry entry) { return itemOf[SparseTable::index(entry)]; });
+    }
+
+    /// Of a job that becomes an item.
+    void addGradients(size_t job) {
+        for (size_t c = 0; c < channels_; ++c) {
+            const Moments& m = moments(job, c);
+            const auto gradient = m.min == m.max
+                                      ? std::array<float, 3>{}
+                                      : fitGradient(corners_[job * channels_ + c], size_);
+            baked_.gradients.insert(baked_.gradients.end(), gradient.begin(), gradient.end());
+        }
     }
 
     /// Corner values over all super-voxels together.
@@ -276,6 +286,7 @@ class Baker {
                 known.try_emplace(std::move(key), static_cast<Entry>(itemJobs_.size() + 1));
             if (isNew) {
                 itemJobs_.push_back(job);
+                addGradients(job);
                 baked_.shapes.insert(baked_.shapes.end(), shape.begin(), shape.end());
             }
             return it->second;
@@ -438,20 +449,35 @@ class Baker {
 BakedVolume bake(const ExtinctionField& field, const BakeOptions& options) {
     BakedVolume baked = Baker(field, options).bake();
     addLevels(baked, field.box(), options.levels);
+    if (options.sidecarBytes > 0) {
+        addPreview(baked, field, options.sidecarBytes);
+    }
     return baked;
 }
 
-trk::SidecarHeader sidecarHeader(const trk::DensitySummary& source, const BakeOptions& options) {
+uint64_t sidecarLimit(uint64_t sourceBytes) {
+    constexpr uint64_t kSmall = 4000000;
+    constexpr uint64_t kLeast = 100000;
+    return std::max(kLeast, sourceBytes / (sourceBytes < kSmall ? 5 : 10));
+}
+
+trk::SidecarHeader sidecarHeader(const trk::DensitySummary& source, const ExtinctionField& field,
+                                 const BakedVolume& baked) {
     trk::SidecarHeader header;
     header.toolVersion = TRACK_VERSION;
     header.sourceFile = std::filesystem::path(source.path).filename().string();
     header.source = source.grid;
+    header.prefix = source.label;
     header.valueType = source.valueType;
     header.digest = source.digest;
+    header.sourceBytes = source.fileBytes;
+    header.sourceModified = source.fileModified;
     header.indexToWorld = source.indexToWorld;
-    header.superVoxelSize = options.superVoxelSize;
-    header.levels = options.levels;
-    header.controlKind = options.kind;
+    header.superVoxelSize = baked.superVoxelSize();
+    header.levels = static_cast<int>(baked.levels.size());
+    header.controlKind = baked.kind;
+    header.previewSize = baked.previewSize;
+    header.previewScale = previewScale(field, source.indexToWorld);
     header.repair = source.repair;
     header.dropped = source.dropped;
     header.clamped = source.clamped;

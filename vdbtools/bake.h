@@ -6,20 +6,29 @@
 #include "io/sidecar.h"
 #include "super_voxels.h"
 
+#include <cstdint>
+
 namespace vdbtools {
 
 struct BakeOptions {
     int superVoxelSize = 16;  ///< a power of two from 4 to 64, in voxels
-    int levels = 4;           ///< preview levels, each of super-voxels twice as large
+    int levels = 4;           ///< preview levels at most, each of super-voxels twice as large
     trk::ControlKind kind = trk::ControlKind::kConstant;
+    /// What the sidecar may take as a file, which decides how fine the means for pictures are; 0:
+    /// none are made.
+    uint64_t sidecarBytes = 0;
 };
 
 /// Bakes a field, in parallel. The result has the same bits for any number of threads, and with or
 /// without tiles in the source.
 trk::BakedVolume bake(const trk::ExtinctionField& field, const BakeOptions& options);
 
+/// How large a sidecar of a density of `sourceBytes` as a file may be, pictures included.
+uint64_t sidecarLimit(uint64_t sourceBytes);
+
 /// What a sidecar of such a bake says of itself.
-trk::SidecarHeader sidecarHeader(const trk::DensitySummary& source, const BakeOptions& options);
+trk::SidecarHeader sidecarHeader(const trk::DensitySummary& source,
+                                 const trk::ExtinctionField& field, const trk::BakedVolume& baked);
 
 /// How well a bake's control fits, over all occupied super-voxels and channels.
 struct ControlFit {

@@ -25,43 +25,20 @@ constexpr auto kLargest = static_cast<double>(std::numeric_limits<float>::max())
 
 }  // namespace
 
-std::array<float, 3> fitGradient(const CornerMoments& moments, double mean, int size) {
+std::array<float, 3> fitGradient(const CornerMoments& moments, int size) {
     const double n = size;
     // Mean over the vertices of (x - centre)^2, the trapezoid rule of its integral.
     const double spread = n * n / 12 + 1.0 / 6;
-    std::array<double, 3> gradient{};
+    std::array<float, 3> gradient{};
     for (size_t axis = 0; axis < 3; ++axis) {
         double difference = 0;
         for (size_t corner = 0; corner < 8; ++corner) {
             difference += (corner >> (2 - axis) & 1 ? 1 : -1) * moments[corner];
         }
-        gradient[axis] = 0.5 * n * difference / spread;
+        gradient[axis] = static_cast<float>(
+            std::min(std::max(0.5 * n * difference / spread, -kLargest), kLargest));
     }
-    // Least squares are isotropic in the gradient, and the control is >= 0 (and a float) where
-    // |gx| + |gy| + |gz| <= mean / (n / 2): the nearest such gradient has all components shortened
-    // by the same amount [Duchi et al. 2008].
-    const double limit = 2 * std::min(mean, kLargest - mean) / n;
-    std::array<double, 3> sizes{
-        {std::fabs(gradient[0]), std::fabs(gradient[1]), std::fabs(gradient[2])}};
-    std::sort(sizes.begin(), sizes.end(), std::greater<>());
-    double shorten = 0;
-    double sum = 0;
-    for (size_t i = 0; i < 3; ++i) {
-        sum += sizes[i];
-        const double candidate = (sum - limit) / static_cast<double>(i + 1);
-        if (candidate < sizes[i]) {
-            shorten = std::max(candidate, 0.0);
-        }
-    }
-    std::array<float, 3> result{};
-    for (size_t axis = 0; axis < 3; ++axis) {
-        const double length = std::max(std::fabs(gradient[axis]) - shorten, 0.0);
-        // Rounded towards 0, lest rounding makes a corner negative.
-        auto g = static_cast<float>(length);
-        g = static_cast<double>(g) > length ? std::nextafter(g, 0.0f) : g;
-        result[axis] = gradient[axis] < 0 ? -g : g;
-    }
-    return result;
+    return gradient;
 }
 
 size_t CornerFit::Hash::operator()(const Int3& p) const {

@@ -20,9 +20,8 @@ namespace vdbtools {
 /// fit of a multilinear control asks.
 using CornerMoments = std::array<double, 8>;
 
-/// The gradient (density per voxel) that leaves the least squared residual around the mean, among
-/// those with which the control is >= 0 everywhere in a super-voxel of `size` voxels.
-std::array<float, 3> fitGradient(const CornerMoments& moments, double mean, int size);
+/// The gradient (density per voxel) that leaves the least squared residual around the mean.
+std::array<float, 3> fitGradient(const CornerMoments& moments, int size);
 
 /// Corner values of a continuous control over many super-voxels with the least squared residual,
 /// each between 0 and twice the largest density of the super-voxels that touch it, which keep

@@ -1,7 +1,11 @@
 // SPDX-License-Identifier: Apache-2.0
 #include "levels.h"
 
+#include "moments.h"
+
+#include <algorithm>
 #include <array>
+#include <cmath>
 #include <cstddef>
 #include <map>
 #include <optional>
@@ -9,6 +13,7 @@
 namespace vdbtools {
 namespace {
 
+using trk::ExtinctionField;
 using trk::Int3;
 using trk::SparseTable;
 using trk::ValueTable;
@@ -71,20 +76,116 @@ ValueTable nextLevel(const SparseTable& finer, const trk::IntBox& box, size_t ch
     return level;
 }
 
+/// Means of the cubes of 2^shift cells of a field.
+ValueTable meansOf(const ExtinctionField& field, int shift) {
+    if (shift > ExtinctionField::kBrickShift) {
+        const ValueTable finer = meansOf(field, shift - 1);
+        return nextLevel(finer.table, field.box(), field.channels(), [&](size_t item, size_t c) {
+            return finer.values[item * field.channels() + c];
+        });
+    }
+    const size_t channels = field.channels();
+    const auto edge = static_cast<size_t>(1) << shift;
+    ValueTable means;
+    means.table = SparseTable(shift, field.box());
+    const auto add = [&](const float* values) {
+        if (std::all_of(values, values + channels, [](float v) { return v == 0; })) {
+            return SparseTable::kEmpty;
+        }
+        means.values.insert(means.values.end(), values, values + channels);
+        return static_cast<SparseTable::Entry>(means.values.size() / channels);
+    };
+    std::map<SparseTable::Entry, SparseTable::Entry> constants;
+    float vertices[ExtinctionField::kBrickVertices];
+    means.table.fill(
+        [&](const Int3& origin, int regionShift) -> std::optional<SparseTable::Entry> {
+            const auto entry = field.table().uniformEntry(origin, regionShift);
+            if (!entry || !ExtinctionField::isConstant(*entry)) {
+                return std::nullopt;
+            }
+            const auto known = constants.find(*entry);
+            return known != constants.end() ? known->second
+                                            : constants[*entry] = add(field.constant(*entry));
+        },
+        [&](const Int3& origin) {
+            const auto entry = field.table().find(origin[0], origin[1], origin[2]).entry;
+            float values[3] = {0, 0, 0};
+            for (size_t c = 0; c < channels; ++c) {
+                for (size_t x = 0; x <= edge; ++x) {
+                    for (size_t y = 0; y <= edge; ++y) {
+                        for (size_t z = 0; z <= edge; ++z) {
+                            const size_t at = ((static_cast<size_t>(origin[0] & 7) + x) *
+                                                   ExtinctionField::kBrickEdge +
+                                               static_cast<size_t>(origin[1] & 7) + y) *
+                                                  ExtinctionField::kBrickEdge +
+                                              static_cast<size_t>(origin[2] & 7) + z;
+                            vertices[(x * ExtinctionField::kBrickEdge + y) *
+                                         ExtinctionField::kBrickEdge +
+                                     z] = field.vertex(entry, at, c);
+                        }
+                    }
+                }
+                values[c] = static_cast<float>(cubeMoments(BrickChannel{vertices}, edge).mean);
+            }
+            return add(values);
+        },
+        [&](const Int3& origin, int regionShift, SparseTable::Key& key) {
+            return regionShift >= ExtinctionField::kBrickShift &&
+                   field.table().appendKey(origin, regionShift, key);
+        });
+    return means;
+}
+
+int64_t largestExtent(const trk::IntBox& box) {
+    int64_t extent = 0;
+    for (size_t a = 0; a < 3; ++a) {
+        extent = std::max(extent, box.hi[a] - box.lo[a]);
+    }
+    return extent;
+}
+
+/// Bytes of a sidecar without means for pictures: a grid's nodes, which VDB does not compress, and
+/// its values, which compress little.
+double estimatedBytes(const trk::BakedVolume& baked) {
+    constexpr double kGrid = 10500;
+    constexpr double kValue = 4.2;
+    const double statistics = baked.kind == trk::ControlKind::kConstant ? 5 : 7;
+    const auto channels = static_cast<double>(baked.channels);
+    const double grids = statistics + channels + static_cast<double>(baked.levels.size());
+    return kGrid * grids + kValue * channels * (statistics + 3 + 0.15) *
+                               static_cast<double>(baked.items.size() / baked.channels);
+}
+
 }  // namespace
 
 void addLevels(trk::BakedVolume& baked, const trk::IntBox& box, int count) {
     const size_t channels = baked.channels;
     for (int i = 0; i < count; ++i) {
-        if (i == 0) {
-            baked.levels.push_back(nextLevel(
-                baked.table, box, channels,
-                [&](size_t item, size_t c) { return baked.items[item * channels + c].mean; }));
-        } else {
-            const ValueTable& finer = baked.levels.back();
-            baked.levels.push_back(nextLevel(
-                finer.table, box, channels,
-                [&](size_t item, size_t c) { return finer.values[item * channels + c]; }));
+        const SparseTable& finer = i == 0 ? baked.table : baked.levels.back().table;
+        const int64_t size = int64_t{1} << finer.itemShift();
+        if (largestExtent(finer.occupiedBox()) <= 2 * size) {
+            return;
+        }
+        baked.levels.push_back(nextLevel(finer, box, channels, [&](size_t item, size_t c) {
+            return i == 0 ? baked.items[item * channels + c].mean
+                          : baked.levels[static_cast<size_t>(i) - 1].values[item * channels + c];
+        }));
+    }
+}
+
+void addPreview(trk::BakedVolume& baked, const ExtinctionField& field, uint64_t sidecarBytes) {
+    constexpr int64_t kFinest =
+        160;                       // cubes along the longest edge: about three pixels of 512 each
+    constexpr double kCube = 4.4;  // bytes a channel, of values and their nodes
+    const double room = 0.9 * (static_cast<double>(sidecarBytes) - estimatedBytes(baked)) - 10500;
+    const int64_t extent = largestExtent(field.box());
+    for (int shift = 0; shift < baked.superVoxelShift; ++shift) {
+        const double cubes = static_cast<double>(field.brickCount()) * std::pow(8.0, 3.0 - shift);
+        if (extent >> shift <= kFinest &&
+            kCube * cubes * static_cast<double>(field.channels()) <= room) {
+            baked.previewSize = 1 << shift;
+            baked.preview = meansOf(field, shift);
+            return;
         }
     }
 }

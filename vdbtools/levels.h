@@ -1,12 +1,22 @@
 // SPDX-License-Identifier: Apache-2.0
-// Preview levels: means of super-voxels 2, 4, … times as large.
+// Means for pictures: preview levels of super-voxels 2, 4, … times as large, and cubes smaller than
+// super-voxels.
 #pragma once
 
+#include "extinction_field.h"
 #include "super_voxels.h"
+
+#include <cstdint>
 
 namespace vdbtools {
 
-/// Adds `count` levels to a bake of a field that lies in `box` (cells).
+/// Adds levels to a bake of a field that lies in `box` (cells): `count`, or fewer where two
+/// super-voxels an axis hold everything (which may be as few as there can be, with 0 in the middle).
 void addLevels(trk::BakedVolume& baked, const trk::IntBox& box, int count);
+
+/// Adds means of cubes smaller than super-voxels, where the latter are too large for a picture: as
+/// fine as shows in one of 512 pixels, and as keeps the whole bake as a file within `sidecarBytes`,
+/// by estimate.
+void addPreview(trk::BakedVolume& baked, const trk::ExtinctionField& field, uint64_t sidecarBytes);
 
 }  // namespace vdbtools

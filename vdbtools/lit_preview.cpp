@@ -92,8 +92,8 @@ trk::VolumeOptions volumeOptions(const trk::SidecarHeader& header, uint32_t leve
     using namespace trk::schema;
     trk::VolumeOptions options;
     options.gridNamed = true;
-    options.gridName = gridPrefix(header.source.name) +
-                       (level == 0 ? kControlSuffix : levelSuffix(static_cast<int>(level)));
+    options.gridName =
+        header.prefix + (level == 0 ? kControlSuffix : levelSuffix(static_cast<int>(level)));
     options.scale = scale;
     options.color = color;
     return options;

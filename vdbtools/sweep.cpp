@@ -375,7 +375,8 @@ SweepBake bakeInto(Volumes::Bakes& bakes, const Source& source, int size, Contro
     result.residualShare = fit.fieldRms > 0 ? fit.residualRms / fit.fieldRms : 0;
     // Never committed: it leaves nothing behind.
     const trk::OutputFile file(trk::temporaryFolder() + "/measured.track.vdb", true);
-    trk::writeSidecar(file, sidecarHeader(source.summary, options), baked, source.summary.anchor);
+    trk::writeSidecar(file, sidecarHeader(source.summary, *source.field, baked), baked,
+                      source.summary.anchor);
     result.sidecarBytes = std::filesystem::file_size(file.path());
     baked.levels.clear();  // no way looks at them
     return result;

@@ -127,6 +127,7 @@ class Verifier {
         double sum[kChannels] = {};
         double squares[kChannels] = {};
         double deviations[kChannels] = {};
+        double slopes[kChannels][3] = {};  // first moments
         const auto weight = [&](int64_t i) { return i == 0 || i == edge ? 0.5 : 1.0; };
         for (int64_t x = 0; x <= edge; ++x) {
             for (int64_t y = 0; y <= edge; ++y) {
@@ -147,6 +148,9 @@ class Verifier {
                         sum[c] += w * v;
                         squares[c] += w * (v - control) * (v - control);
                         deviations[c] += w * deviation * deviation;
+                        slopes[c][0] += w * v * unit(x);
+                        slopes[c][1] += w * v * unit(y);
+                        slopes[c][2] += w * v * unit(z);
                     }
                 }
             }
@@ -155,8 +159,34 @@ class Verifier {
         for (size_t c = 0; c < kChannels; ++c) {
             std::string wrong = checkSums(place, c, sum[c] / cells, std::sqrt(squares[c] / cells),
                                           std::sqrt(deviations[c] / cells));
+            if (wrong.empty()) {
+                wrong = checkGradient(place, c, slopes[c]);
+            }
             if (!wrong.empty()) {
                 return wrong;
+            }
+        }
+        return {};
+    }
+
+    /// `moments`: sums over the vertices of weight x density x place, the latter from -1/2 to 1/2.
+    std::string checkGradient(const Place& place, size_t channel, const double* moments) const {
+        if (sidecar_.baked.gradients.empty() || sidecar_.baked.isHomogeneous(place.item)) {
+            return {};
+        }
+        const auto n = static_cast<double>(size_);
+        const double spread = 1.0 / 12 + 1 / (6 * n * n);  // mean square of a place
+        const BakedSuperVoxel& item = sidecar_.baked.items[place.item + channel];
+        const double slack = 1e-5 * static_cast<double>(item.max) / n;
+        for (size_t a = 0; a < 3 && item.min < item.max; ++a) {
+            const auto claimed =
+                static_cast<double>(sidecar_.baked.gradients[3 * (place.item + channel) + a]);
+            const double found = moments[a] / (n * n * n) / spread / n;
+            if (std::fabs(claimed - found) > 1e-5 * std::fabs(found) + slack) {
+                std::ostringstream line;
+                line << name(place, channel) << ": gradient " << claimed << " along axis " << a
+                     << ", but it is " << found;
+                return line.str();
             }
         }
         return {};

@@ -6,7 +6,10 @@
 
 #include <algorithm>
 #include <array>
+#include <cmath>
 #include <cstddef>
+#include <functional>
+#include <limits>
 #include <string>
 
 namespace trk {
@@ -28,6 +31,40 @@ inline const char* controlName(ControlKind kind) {
             break;
     }
     return "constant";
+}
+
+/// The gradient (density per voxel) of an affine control, from the least-squares one of the
+/// density: the nearest for which the control, whose mean is given, is >= 0 everywhere in a
+/// super-voxel of `size` voxels, and a float. Least squares are isotropic in the gradient, and such
+/// are those with |gx| + |gy| + |gz| <= mean / (size / 2): all components are shortened by the same
+/// amount [Duchi et al. 2008].
+inline std::array<float, 3> constrainGradient(const float* gradient, double mean, int size) {
+    constexpr auto kLargest = static_cast<double>(std::numeric_limits<float>::max());
+    const double limit = 2 * std::min(mean, kLargest - mean) / size;
+    std::array<double, 3> sizes{};
+    for (size_t axis = 0; axis < 3; ++axis) {
+        sizes[axis] = std::fabs(static_cast<double>(gradient[axis]));
+    }
+    std::sort(sizes.begin(), sizes.end(), std::greater<>());
+    double shorten = 0;
+    double sum = 0;
+    for (size_t i = 0; i < 3; ++i) {
+        sum += sizes[i];
+        const double candidate = (sum - limit) / static_cast<double>(i + 1);
+        if (candidate < sizes[i]) {
+            shorten = std::max(candidate, 0.0);
+        }
+    }
+    std::array<float, 3> result{};
+    for (size_t axis = 0; axis < 3; ++axis) {
+        const double length =
+            std::max(std::fabs(static_cast<double>(gradient[axis])) - shorten, 0.0);
+        // Rounded towards 0, lest rounding makes a corner negative.
+        auto g = static_cast<float>(length);
+        g = static_cast<double>(g) > length ? std::nextafter(g, 0.0f) : g;
+        result[axis] = gradient[axis] < 0 ? -g : g;
+    }
+    return result;
 }
 
 /// Numbers a bake stores besides the mean: a gradient (x, y, z), or corner values (x slowest).

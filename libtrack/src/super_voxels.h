@@ -42,8 +42,13 @@ struct BakedVolume {
     ControlKind kind = ControlKind::kConstant;
     SparseTable table;
     std::vector<BakedSuperVoxel> items;
-    std::vector<float> shapes;       ///< shapeSize(kind) numbers a channel, see control_shape.h
+    std::vector<float> shapes;  ///< shapeSize(kind) numbers a channel, see control_shape.h
+    /// The density's least-squares gradient per voxel, 3 numbers a channel, whatever the kind:
+    /// coarser super-voxels follow from it. Empty where nobody asked for it.
+    std::vector<float> gradients;
     std::vector<ValueTable> levels;  ///< means of super-voxels 2, 4, … times as large
+    int previewSize = 0;             ///< edge of the cubes of `preview`; 0: there is none
+    ValueTable preview;              ///< means of smaller cubes, for pictures alone
 
     int superVoxelSize() const { return 1 << superVoxelShift; }
     const float* shape(size_t item) const { return shapes.data() + item * shapeSize(kind); }

@@ -50,11 +50,11 @@ struct Scene {
         options.gridNamed = true;
         options.gridName = "density";
         const trk::Density density = fixtures::load(vdb, options.gridName);
-        const auto bakeOptions = fixtures::bakeOptions(16, 0);
+        const trk::BakedVolume baked = vdbtools::bake(density.field, fixtures::bakeOptions(16, 0));
         {
             trk::OutputFile file(sidecar, true);
-            trk::writeSidecar(file, vdbtools::sidecarHeader(density.summary, bakeOptions),
-                              vdbtools::bake(density.field, bakeOptions), density.summary.anchor);
+            trk::writeSidecar(file, vdbtools::sidecarHeader(density.summary, density.field, baked),
+                              baked, density.summary.anchor);
             file.commit();
         }
         const trk::Volume unscaled = trk::openVolume(vdb.c_str(), "", options);

@@ -97,7 +97,7 @@ TEST(Sweep, MeasuredVarianceIsThePredictedOne) {
     SweepOptions options = smallSweep();
     options.depths = {1};
     options.coloured = false;
-    options.rounds = fixtures::kSanitized ? 64 : 400;
+    options.rounds = fixtures::kSanitized ? 200 : 400;
     const Sweep sweep = run(fixtures::loadSource(fixtures::cloudFile(64)), options);
     int compared = 0;
     for (const SweepRow& row : sweep.rows) {

@@ -140,8 +140,9 @@ void bake(const std::string& vdb, const std::string& sidecar, int size, int leve
     const trk::Density density = load(vdb);
     const vdbtools::BakeOptions options = bakeOptions(size, levels, kind);
     trk::OutputFile file(sidecar, true);
-    trk::writeSidecar(file, vdbtools::sidecarHeader(density.summary, options),
-                      vdbtools::bake(density.field, options), density.summary.anchor);
+    const trk::BakedVolume baked = vdbtools::bake(density.field, options);
+    trk::writeSidecar(file, vdbtools::sidecarHeader(density.summary, density.field, baked), baked,
+                      density.summary.anchor);
     file.commit();
 }
 

@@ -92,7 +92,8 @@ TEST(ControlFit, AnUnboundedRampLeavesAtMostEightUlp) {
             for (const double m : moments[i]) {
                 mean += m;
             }
-            const auto gradient = vdbtools::fitGradient(moments[i], mean, size);
+            const auto gradient =
+                trk::constrainGradient(vdbtools::fitGradient(moments[i], size).data(), mean, size);
             const auto affine = trk::controlPolynomial(
                 ControlKind::kAffine, static_cast<float>(mean), gradient.data(), size);
             for (int v = 0; v < 27; ++v) {

@@ -11,6 +11,7 @@
 #include <gtest/gtest.h>
 
 #include <cstring>
+#include <filesystem>
 #include <functional>
 #include <map>
 
@@ -81,7 +82,8 @@ TEST(Sidecar, ReadsBackWhatWasWritten) {
             trk::readSidecar(baked.sidecar, &baked.density.summary, TRK_CHECK_FULL);
         EXPECT_EQ(read.header.superVoxelSize, size);
         EXPECT_EQ(read.header.digest, baked.density.summary.digest);
-        ASSERT_EQ(read.baked.levels.size(), 2u);
+        EXPECT_EQ(read.baked.levels.size(), expected.levels.size());
+        EXPECT_EQ(read.baked.levels.size(), size == 64 ? 0u : 2u);
         size_t compared = 0;
         expected.table.forEach([&](const trk::Int3& lo, int, trk::SparseTable::Entry entry) {
             const auto found = read.baked.table.find(lo[0], lo[1], lo[2]);
@@ -105,21 +107,24 @@ TEST(Sidecar, IsAPlainVdbWhoseGridsLieOverTheSource) {
     const Baked baked = makeBaked("plain", 8);
     openvdb::io::File file(baked.sidecar);
     file.open();
-    for (const char* name : {"density_control", "density_majorant", "density_rms", "density_min",
-                             "density_max", "density_control_level_1", "density_control_level_2"}) {
+    for (const char* name :
+         {"density_control", "density_majorant", "density_rms", "density_min", "density_max",
+          "density_gradient", "density_control_level_1", "density_control_level_2"}) {
         ASSERT_TRUE(file.hasGrid(name)) << name;
         const auto grid = file.readGrid(name);
-        EXPECT_EQ(grid->metaValue<std::string>("track_format"), "1.0");
+        EXPECT_EQ(grid->metaValue<std::string>("track_format"), "2.0");
         EXPECT_EQ(grid->metaValue<std::string>("track_source_grid"), "density");
         EXPECT_EQ(grid->metaValue<int32_t>("track_super_voxel_size"), 8);
     }
     const auto control = file.readGrid("density_control");
-    // Index i lies at source index 8 i + 4, in world space 0.1 (8 i + 4) + (3, 4, 5).
-    const openvdb::Vec3d world = control->indexToWorld(openvdb::Vec3d(1, 2, 3));
-    EXPECT_NEAR(world.x(), 0.1 * 12 + 3, 1e-12);
-    EXPECT_NEAR(world.z(), 0.1 * 28 + 5, 1e-12);
+    // The volume begins at index -1, so that index 0 is at -32, a multiple of the coarsest
+    // level's 32. Index i lies at source index 8 i + 4 - 32, in world space 0.1 (8 i - 28) + (3, 4,
+    // 5).
+    const openvdb::Vec3d world = control->indexToWorld(openvdb::Vec3d(4, 5, 6));
+    EXPECT_NEAR(world.x(), 0.1 * 4 + 3, 1e-12);
+    EXPECT_NEAR(world.z(), 0.1 * 20 + 5, 1e-12);
     const auto level = file.readGrid("density_control_level_1");
-    EXPECT_NEAR(level->indexToWorld(openvdb::Vec3d(1, 0, 0)).x(), 0.1 * 24 + 3, 1e-12);
+    EXPECT_NEAR(level->indexToWorld(openvdb::Vec3d(2, 0, 0)).x(), 0.1 * 8 + 3, 1e-12);
 }
 
 TEST(Sidecar, EmptyVolumesHaveSidecarsToo) {
@@ -178,9 +183,10 @@ TEST(Sidecar, RefusesNewerFormatsAndForeignFiles) {
             }
         });
     };
-    expectRefused(baked, withFormat("newer.vdb", "2.0"), TRK_ERROR_SIDECAR_MISMATCH, "format 2.0");
+    expectRefused(baked, withFormat("newer.vdb", "3.0"), TRK_ERROR_SIDECAR_MISMATCH, "format 3.0");
+    expectRefused(baked, withFormat("older.vdb", "1.0"), TRK_ERROR_SIDECAR_MISMATCH, "bake again");
     EXPECT_NO_THROW(
-        trk::readSidecar(withFormat("minor.vdb", "1.7"), &baked.density.summary, TRK_CHECK_FULL));
+        trk::readSidecar(withFormat("minor.vdb", "2.7"), &baked.density.summary, TRK_CHECK_FULL));
     expectRefused(baked, withFormat("odd.vdb", "x"), TRK_ERROR_BAD_FILE, "format is");
     expectRefused(baked, baked.vdb, TRK_ERROR_BAD_FILE, "expected a sidecar");
     const std::string extra = altered(baked, "extra.vdb", [](Grids& grids) {
@@ -194,7 +200,7 @@ TEST(Sidecar, RefusesNewerFormatsAndForeignFiles) {
 TEST(Sidecar, RefusesMissingOrMixedGrids) {
     const Baked baked = makeBaked("missing");
     for (const char* name : {"density_control", "density_majorant", "density_rms", "density_min",
-                             "density_max", "density_control_level_2"}) {
+                             "density_max", "density_gradient", "density_control_level_2"}) {
         const std::string file =
             altered(baked, "missing-one.vdb", [&](Grids& grids) { grids.erase(name); });
         expectRefused(baked, file, TRK_ERROR_BAD_FILE,
@@ -208,7 +214,7 @@ TEST(Sidecar, RefusesMissingOrMixedGrids) {
 
 TEST(Sidecar, RefusesImplausibleBounds) {
     const Baked baked = makeBaked("bounds");
-    const Coord at(2, 3, 3);
+    const Coord at(6, 7, 7);
     const auto with = [&](const std::string& grid, float value) {
         return altered(baked, "bounds-changed.vdb", [&](Grids& grids) {
             floatGrid(grids, "density_" + grid).tree().setValue(at, value);
@@ -247,12 +253,112 @@ TEST(Sidecar, LevelsOfFarPartsAreReadWhole) {
             vdbtools::bake(density.field, fixtures::bakeOptions(size, 8));
         const trk::Sidecar read = trk::readSidecar(sidecar, &density.summary, TRK_CHECK_FULL);
         EXPECT_EQ(read.baked.table.occupiedItems(), baked.table.occupiedItems());
+        ASSERT_EQ(read.baked.levels.size(), 8u);
         for (size_t level = 0; level < 8; ++level) {
             EXPECT_EQ(read.baked.levels[level].table.occupiedItems(),
                       baked.levels[level].table.occupiedItems())
                 << "size " << size << " level " << level + 1;
         }
     }
+}
+
+/// A ball of n^3 voxels with some texture, at an offset.
+openvdb::FloatGrid::Ptr ballAt(int n, const Coord& offset) {
+    auto ball = openvdb::FloatGrid::create();
+    ball->setName("density");
+    const auto blob = fixtures::makeBlob(n);
+    for (auto it = blob->cbeginValueOn(); it; ++it) {
+        ball->tree().setValue(it.getCoord() + offset, *it);
+    }
+    return ball;
+}
+
+// OpenVDB's nodes have masks that it does not compress: a tree that straddles eight of them costs
+// 0.7 MB.
+TEST(Sidecar, OfASmallVolumeIsSmallWhereverThatLies) {
+    std::vector<float> controls;
+    for (const Coord& offset : {Coord(0), Coord(-10), Coord(4090, -4100, 65530),
+                                Coord(-7, 100, 8185), Coord(2000000000, -2000000000, 5)}) {
+        const std::string vdb = fixtures::write("ball.vdb", {ballAt(20, offset)});
+        const trk::Density density = fixtures::load(vdb);
+        vdbtools::BakeOptions options = fixtures::bakeOptions(16, 4);
+        options.sidecarBytes = vdbtools::sidecarLimit(density.summary.fileBytes);
+        const trk::BakedVolume baked = vdbtools::bake(density.field, options);
+        const std::string sidecar = fixtures::path("ball.track.vdb");
+        trk::OutputFile file(sidecar, true);
+        trk::writeSidecar(file, vdbtools::sidecarHeader(density.summary, density.field, baked),
+                          baked, density.summary.anchor);
+        file.commit();
+        EXPECT_LE(std::filesystem::file_size(sidecar), 100000u) << offset;
+        EXPECT_GT(baked.previewSize, 0) << offset;
+        const trk::Sidecar read =
+            trk::readSidecar(sidecar, &density.summary, TRK_CHECK_FULL, trk::SidecarParts::kAll);
+        EXPECT_TRUE(vdbtools::verify(density.summary, read).holds) << offset;
+        EXPECT_EQ(read.baked.previewSize, baked.previewSize);
+        EXPECT_EQ(read.baked.preview.table.occupiedItems(), baked.preview.table.occupiedItems());
+        const trk::Sidecar alone = trk::readSidecar(sidecar, nullptr, TRK_CHECK_FULL);
+        for (size_t a = 0; a < 3; ++a) {
+            const int axis = static_cast<int>(a);
+            EXPECT_NEAR(alone.header.indexToWorld.translation[axis], 0, 2e-6) << offset;
+            EXPECT_LE(alone.header.origin[a], offset[axis] - 1);
+        }
+    }
+}
+
+TEST(Sidecar, GradientsAreOfEveryKindAndReadBack) {
+    const Baked baked = makeBaked("gradients", 8);
+    for (const auto kind :
+         {trk::ControlKind::kConstant, trk::ControlKind::kAffine, trk::ControlKind::kTrilinear}) {
+        fixtures::bake(baked.vdb, baked.sidecar, 8, 2, kind);
+        const trk::BakedVolume expected =
+            vdbtools::bake(baked.density.field, fixtures::bakeOptions(8, 2, kind));
+        const trk::Sidecar read = trk::readSidecar(baked.sidecar, &baked.density.summary,
+                                                   TRK_CHECK_FULL, trk::SidecarParts::kAll);
+        size_t sloped = 0;
+        expected.table.forEach([&](const trk::Int3& lo, int, trk::SparseTable::Entry entry) {
+            const auto found = read.baked.table.find(lo[0], lo[1], lo[2]).entry;
+            const size_t a = 3 * trk::SparseTable::index(entry);
+            const size_t b = 3 * trk::SparseTable::index(found);
+            for (size_t k = 0; k < 3; ++k) {
+                EXPECT_EQ(read.baked.gradients[b + k], expected.gradients[a + k]);
+                sloped += expected.gradients[a + k] != 0 ? 1 : 0;
+            }
+        });
+        EXPECT_GT(sloped, 100u);
+        EXPECT_TRUE(vdbtools::verify(baked.density.summary, read).holds);
+        const std::string wrong = altered(baked, "wrong-gradient.vdb", [](Grids& grids) {
+            const auto grid =
+                openvdb::gridPtrCast<openvdb::Vec3SGrid>(grids.at("density_gradient"));
+            auto it = grid->beginValueOn();
+            while (it->x() == 0) {
+                ++it;
+            }
+            it.setValue(openvdb::Vec3f(1.001f * it->x(), it->y(), it->z()));
+        });
+        const trk::Sidecar lie = trk::readSidecar(wrong, &baked.density.summary, TRK_CHECK_FULL,
+                                                  trk::SidecarParts::kAll);
+        EXPECT_NE(vdbtools::verify(baked.density.summary, lie).counterexample, "");
+    }
+}
+
+// Of grids of one name, the sidecar of each bears its index.
+TEST(Sidecar, OfOneOfSeveralGridsOfANameBearsItsIndex) {
+    const std::string vdb =
+        fixtures::write("twins.vdb", {fixtures::makeBlob(20), fixtures::makeBlob(30)});
+    const trk::Density density = fixtures::load(vdb, "density[1]");
+    const trk::BakedVolume baked = vdbtools::bake(density.field, fixtures::bakeOptions(8, 1));
+    const std::string sidecar = fixtures::path("twins.track.vdb");
+    trk::OutputFile file(sidecar, true);
+    trk::writeSidecar(file, vdbtools::sidecarHeader(density.summary, density.field, baked), baked,
+                      density.summary.anchor);
+    file.commit();
+    openvdb::io::File grids(sidecar);
+    grids.open();
+    EXPECT_TRUE(grids.hasGrid("density[1]_control"));
+    EXPECT_EQ(trk::readSidecarHeader(sidecar).source.index, 1);
+    EXPECT_TRUE(vdbtools::verify(density.summary,
+                                 trk::readSidecar(sidecar, &density.summary, TRK_CHECK_FULL))
+                    .holds);
 }
 
 TEST(Sidecar, RefusesGridsThatCoverDifferentBoxes) {

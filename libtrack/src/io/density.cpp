@@ -149,7 +149,10 @@ Density loadDensity(const std::string& path, const DensityOptions& options) {
     Density density;
     grid->apply<DensityGrids>([&](const auto& typed) { density = convert(typed, options, where); });
     density.summary.path = path;
+    density.summary.fileBytes = file.bytes();
+    density.summary.fileModified = file.modified();
     density.summary.grid = {entry.name, entry.index};
+    density.summary.label = entry.label();
     density.summary.valueType = valueTypeName(entry.type);
     density.summary.indexToWorld = map;
     return density;

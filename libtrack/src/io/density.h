@@ -21,7 +21,10 @@ struct DensityOptions {
 /// What is known of a source grid besides its values.
 struct DensitySummary {
     std::string path;
+    uint64_t fileBytes = 0;    ///< the file's size, and when it was written,
+    int64_t fileModified = 0;  ///< in nanoseconds since 1970
     GridIdentity grid;
+    std::string label;      ///< NAME, or NAME[i] where that alone is ambiguous or empty
     std::string valueType;  ///< "float", "double", "vec3s" or "vec3d"
     AffineMap indexToWorld;
     Int3 anchor{{0, 0, 0}};

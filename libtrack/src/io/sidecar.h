@@ -15,15 +15,21 @@ namespace trk {
 /// The metadata on every grid of a sidecar.
 struct SidecarHeader {
     std::string toolVersion;
-    std::string sourceFile;  ///< base name, informative
+    std::string sourceFile;      ///< base name, informative
+    uint64_t sourceBytes = 0;    ///< the source file's size, and when it was written,
+    int64_t sourceModified = 0;  ///< in nanoseconds since 1970: to see quickly what is current
     GridIdentity source;
+    std::string prefix;               ///< that the names of its grids begin with
     std::string valueType = "float";  ///< of the source grid and of the sidecar's statistics
     uint64_t digest = 0;
     AffineMap indexToWorld;  ///< the source's
+    Int3 origin{{0, 0, 0}};  ///< source index of the corner that all grids count from
     int superVoxelSize = 16;
     ControlKind controlKind = ControlKind::kConstant;
     int levels = 0;
-    uint32_t repair = 0;  ///< TRK_REPAIR_… bits the bake was allowed
+    int previewSize = 0;      ///< edge of the cubes whose means are there for pictures; 0: none
+    double previewScale = 1;  ///< at which the volume shows well
+    uint32_t repair = 0;      ///< TRK_REPAIR_… bits the bake was allowed
     uint64_t dropped = 0;
     uint64_t clamped = 0;
 };
@@ -38,15 +44,21 @@ struct Sidecar {
 bool isSidecar(const std::string& path);
 
 /// Metadata only. Throws Error: BAD_FILE for a file that is no sidecar, SIDECAR_MISMATCH for a
-/// format newer than this build's.
-SidecarHeader readSidecarHeader(const std::string& path);
+/// format of another major version than this build's. `source`: of the sidecars in the file, the
+/// one baked from that grid; NULL, or where there is none, the first.
+SidecarHeader readSidecarHeader(const std::string& path, const GridIdentity* source = nullptr);
 
-/// The whole bake, checked as far as `check` says, against `density` unless that is NULL (a sidecar
+/// How much of a bake is read: what queries need, or gradients and means for pictures too.
+enum class SidecarParts { kQueries, kAll };
+
+/// The bake, checked as far as `check` says, against `density` unless that is NULL (a sidecar
 /// opened alone, whose anchor is then its own).
-Sidecar readSidecar(const std::string& path, const DensitySummary* density, TrkCheck check);
+Sidecar readSidecar(const std::string& path, const DensitySummary* density, TrkCheck check,
+                    SidecarParts parts = SidecarParts::kQueries);
 
 /// Writes the grids one after another, so that only one is in memory at a time. Does not commit.
-void writeSidecar(const OutputFile& file, const SidecarHeader& header, const BakedVolume& baked,
+/// `header.origin` is chosen here.
+void writeSidecar(const OutputFile& file, SidecarHeader header, const BakedVolume& baked,
                   const Int3& anchor);
 
 }  // namespace trk

@@ -5,8 +5,11 @@
 #include "density_types.h"
 #include "sidecar_schema.h"
 
+#include <cmath>
 #include <cstdio>
 #include <cstdlib>
+#include <cstring>
+#include <limits>
 
 namespace trk {
 
@@ -22,16 +25,30 @@ int metaNumber(const openvdb::GridBase& grid, const char* name, const std::strin
     return meta->value();
 }
 
-/// The grid whose name ends in _control; others are found from its prefix.
-const VdbEntry* findControl(const VdbFile& file) {
-    const std::string suffix = kControlSuffix;
+bool hasSuffix(const std::string& name, const std::string& suffix) {
+    return name.size() > suffix.size() &&
+           name.compare(name.size() - suffix.size(), suffix.size(), suffix) == 0;
+}
+
+/// The grid whose name ends in _control, of the sidecar of `source` where the file has several;
+/// others are found from its prefix.
+const VdbEntry* findControl(VdbFile& file, const GridIdentity* source) {
+    const VdbEntry* first = nullptr;
     for (const VdbEntry& entry : file.entries()) {
-        if (entry.name.size() > suffix.size() &&
-            entry.name.compare(entry.name.size() - suffix.size(), suffix.size(), suffix) == 0) {
+        if (!hasSuffix(entry.name, kControlSuffix)) {
+            continue;
+        }
+        first = first ? first : &entry;
+        const openvdb::GridBase::Ptr grid = source ? file.readMetadata(entry) : nullptr;
+        const auto name =
+            grid ? grid->getMetadata<openvdb::StringMetadata>("track_source_grid") : nullptr;
+        const auto index =
+            grid ? grid->getMetadata<openvdb::Int32Metadata>("track_source_index") : nullptr;
+        if (name && index && name->value() == source->name && index->value() == source->index) {
             return &entry;
         }
     }
-    return nullptr;
+    return first;
 }
 
 std::string label(const GridIdentity& grid) {
@@ -55,18 +72,18 @@ std::string metaText(const openvdb::GridBase& grid, const char* name, const std:
 void checkFormat(const openvdb::GridBase& grid, const std::string& where) {
     const std::string format = metaText(grid, "track_format", where);
     const int major = std::atoi(format.c_str());
-    if (major > kFormatMajor) {
-        throw Error(TRK_ERROR_SIDECAR_MISMATCH, where + ": sidecar format " + format +
-                                                    "; this build reads up to " + kFormat +
-                                                    "; bake again, or use a newer vdbtrack");
-    }
     if (major < 1) {
         badSidecar(where, "sidecar format is \"" + format + "\"; expected " + kFormat);
     }
+    if (major != kFormatMajor) {
+        throw Error(TRK_ERROR_SIDECAR_MISMATCH,
+                    where + ": sidecar format " + format + "; this build reads " + kFormat +
+                        "; bake again" + (major > kFormatMajor ? ", or use a newer version" : ""));
+    }
 }
 
-SidecarHeader readHeader(VdbFile& file) {
-    const VdbEntry* control = findControl(file);
+SidecarHeader readHeader(VdbFile& file, const GridIdentity* source) {
+    const VdbEntry* control = findControl(file, source);
     if (!control) {
         badSidecar(file.path(),
                    "no grid …_control; expected a sidecar; the file has " + file.listing());
@@ -78,6 +95,7 @@ SidecarHeader readHeader(VdbFile& file) {
     }
     checkFormat(*grid, where);
     SidecarHeader header;
+    header.prefix = control->name.substr(0, control->name.size() - std::strlen(kControlSuffix));
     header.toolVersion = metaText(*grid, "track_tool_version", where);
     header.sourceFile = metaText(*grid, "track_source_file", where);
     header.source.name = metaText(*grid, "track_source_grid", where);
@@ -86,6 +104,14 @@ SidecarHeader readHeader(VdbFile& file) {
         std::strtoull(metaText(*grid, "track_source_digest", where).c_str(), nullptr, 16);
     header.superVoxelSize = metaNumber(*grid, "track_super_voxel_size", where);
     header.levels = metaNumber(*grid, "track_levels", where);
+    header.previewSize = metaNumber(*grid, "track_preview_size", where);
+    const auto scale = grid->getMetadata<openvdb::DoubleMetadata>("track_preview_scale");
+    header.previewScale = scale ? scale->value() : 1;
+    const auto origin = grid->getMetadata<openvdb::Vec3DMetadata>("track_origin");
+    const auto bytes = grid->getMetadata<openvdb::Int64Metadata>("track_source_bytes");
+    const auto modified = grid->getMetadata<openvdb::Int64Metadata>("track_source_modified");
+    header.sourceBytes = bytes ? static_cast<uint64_t>(bytes->value()) : 0;
+    header.sourceModified = modified ? modified->value() : 0;
     header.valueType = grid->valueType();
     const int size = header.superVoxelSize;
     if (size < 4 || size > 64 || (size & (size - 1)) != 0) {
@@ -94,6 +120,26 @@ SidecarHeader readHeader(VdbFile& file) {
     }
     if (header.levels < 0 || header.levels > 8) {
         badSidecar(where, std::to_string(header.levels) + " levels; expected 0 to 8");
+    }
+    const int preview = header.previewSize;
+    if (preview < 0 || preview >= size || (preview & (preview - 1)) != 0) {
+        badSidecar(where, "cubes of " + std::to_string(preview) +
+                              " voxels for pictures; expected a power of two below the "
+                              "super-voxels' " +
+                              std::to_string(size) + ", or 0");
+    }
+    if (!(header.previewScale >= 0) || !std::isfinite(header.previewScale)) {
+        badSidecar(where, "a scale for pictures of " + std::to_string(header.previewScale) +
+                              "; expected a finite number >= 0");
+    }
+    for (int a = 0; a < 3; ++a) {
+        const double x = origin ? origin->value()[a] : std::numeric_limits<double>::quiet_NaN();
+        if (!(std::fabs(x) < 0x1p33) || x != std::floor(x) ||
+            (static_cast<int64_t>(x) & (size - 1)) != 0) {
+            badSidecar(where,
+                       "no metadata track_origin that is a multiple of the super-voxels' size");
+        }
+        header.origin[static_cast<size_t>(a)] = static_cast<int64_t>(x);
     }
     const std::string kind = metaText(*grid, "track_control", where);
     const std::string interpolation = metaText(*grid, "track_interpolation", where);
@@ -124,7 +170,7 @@ SidecarHeader readHeader(VdbFile& file) {
         header.clamped = static_cast<uint64_t>(meta->value());
     }
     const bool atCorners = header.controlKind == ControlKind::kTrilinear;
-    header.indexToWorld = sourceMap(affineMap(grid->constTransform(), where), size,
+    header.indexToWorld = sourceMap(affineMap(grid->constTransform(), where), header.origin, size,
                                     atCorners ? 0 : centreOffset(size));
     return header;
 }
@@ -163,14 +209,14 @@ void checkAgainst(const SidecarHeader& header, const DensitySummary& density, Tr
 
 bool isSidecar(const std::string& path) {
     VdbFile file(path);
-    const VdbEntry* control = findControl(file);
+    const VdbEntry* control = findControl(file, nullptr);
     const openvdb::GridBase::Ptr grid = control ? file.readMetadata(*control) : nullptr;
     return grid && grid->getMetadata<openvdb::StringMetadata>("track_format");
 }
 
-SidecarHeader readSidecarHeader(const std::string& path) {
+SidecarHeader readSidecarHeader(const std::string& path, const GridIdentity* source) {
     VdbFile file(path);
-    return readHeader(file);
+    return readHeader(file, source);
 }
 
 }  // namespace trk

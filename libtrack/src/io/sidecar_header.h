@@ -19,7 +19,8 @@ std::string metaText(const openvdb::GridBase& grid, const char* name, const std:
 /// Throws where a grid's format is none, or newer than this build's.
 void checkFormat(const openvdb::GridBase& grid, const std::string& where);
 
-SidecarHeader readHeader(VdbFile& file);
+/// As readSidecarHeader.
+SidecarHeader readHeader(VdbFile& file, const GridIdentity* source);
 
 /// Throws SIDECAR_MISMATCH where the density is not the one that was baked.
 void checkAgainst(const SidecarHeader& header, const DensitySummary& density, TrkCheck check,

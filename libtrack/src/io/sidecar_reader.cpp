@@ -37,11 +37,13 @@ const VdbEntry& findGrid(const VdbFile& file, const std::string& name) {
 
 class SidecarReader {
   public:
-    SidecarReader(VdbFile& file, const SidecarHeader& header, TrkCheck check)
+    SidecarReader(VdbFile& file, const SidecarHeader& header, TrkCheck check, SidecarParts parts)
         : file_(file),
           header_(header),
           check_(check),
-          prefix_(gridPrefix(header.source.name)),
+          parts_(parts),
+          hasGradients_(parts == SidecarParts::kAll || header.controlKind == ControlKind::kAffine),
+          prefix_(header.prefix),
           channels_(static_cast<size_t>(channelCount(header.valueType))),
           statistics_(statistics(header.controlKind)) {
         while (1 << shift_ < header.superVoxelSize) {
@@ -58,11 +60,18 @@ class SidecarReader {
         for (const Statistic& statistic : statistics_) {
             readItems(header_.valueType, statistic.suffix, Values::kNotNegative, anchor, sidecar);
         }
-        if (baked.kind == ControlKind::kAffine) {
+        if (hasGradients_) {
             for (const std::string& suffix : gradientSuffixes(channels_)) {
                 readItems(vectorType(header_.valueType), suffix, Values::kSigned, anchor, sidecar);
             }
-        } else if (baked.kind == ControlKind::kTrilinear) {
+        }
+        for (const std::string& suffix : gradientSuffixes(channels_)) {
+            findGrid(file_, prefix_ + suffix);
+        }
+        if (header_.previewSize > 0) {
+            findGrid(file_, prefix_ + previewSuffix(header_.previewSize));
+        }
+        if (baked.kind == ControlKind::kTrilinear) {
             const auto grid = readGrid(header_.valueType, kControlSuffix, shift_, 0);
             checkAnchor(supportBox(*grid, shift_), sidecar.anchor, grid->getName());
             corners_ = makeTable(*grid, shift_, sidecar.anchor, Values::kNotNegative);
@@ -76,14 +85,25 @@ class SidecarReader {
             checkAnchor(supportBox(*grid, shift), sidecar.anchor, grid->getName());
             baked.levels.push_back(makeTable(*grid, shift, sidecar.anchor, Values::kNotNegative));
         }
+        if (parts_ == SidecarParts::kAll && header_.previewSize > 0) {
+            int shift = 0;
+            while (1 << shift < header_.previewSize) {
+                ++shift;
+            }
+            const auto grid = readGrid(header_.valueType, previewSuffix(header_.previewSize), shift,
+                                       centreOffset(header_.previewSize));
+            checkAnchor(supportBox(*grid, shift), sidecar.anchor, grid->getName());
+            baked.previewSize = header_.previewSize;
+            baked.preview = makeTable(*grid, shift, sidecar.anchor, Values::kNotNegative);
+        }
     }
 
   private:
     enum class Values { kNotNegative, kSigned };
 
-    /// Entries that make a super-voxel: of at most six statistics and three gradients or eight
+    /// Entries that make a super-voxel: of at most six statistics, three gradients and eight
     /// corners; an even number, to hash.
-    using Entries = std::array<SparseTable::Entry, 16>;
+    using Entries = std::array<SparseTable::Entry, 18>;
     struct Hash {
         size_t operator()(const Entries& entries) const {
             return hashWords(entries.data(), entries.size() / 2, 0);
@@ -128,7 +148,7 @@ class SidecarReader {
                 if (empty == tables_.size()) {
                     return SparseTable::kEmpty;
                 }
-                const Int3 at = superVoxel(local, shift_, sidecar.anchor);
+                const Int3 at = gridIndex(local, shift_, sidecar.anchor);
                 if (empty > 0) {
                     badSidecar(
                         file_.path(),
@@ -193,16 +213,24 @@ class SidecarReader {
     void addItems(const Entries& entries, bool varies, const Int3& at, BakedVolume& baked) const {
         for (size_t c = 0; c < channels_; ++c) {
             const BakedSuperVoxel item = itemOf(entries, c);
-            const size_t size = shapeSize(baked.kind);
-            for (size_t k = 0; k < size; ++k) {
-                float value = baked.kind == ControlKind::kTrilinear ? item.mean : 0;
-                if (varies && baked.kind == ControlKind::kTrilinear) {
-                    value = valueOf(corners_, entries[tables_.size() + k], c);
-                } else if (varies) {
-                    const size_t table = statistics_.size() + c;
-                    value = tables_[table].values[(entries[table] - 1) * 3 + k];
+            float gradient[3] = {0, 0, 0};
+            if (hasGradients_) {
+                const size_t table = statistics_.size() + c;
+                if (entries[table] != SparseTable::kEmpty) {
+                    std::copy_n(&tables_[table].values[(entries[table] - 1) * 3], 3, gradient);
                 }
-                baked.shapes.push_back(value);
+                baked.gradients.insert(baked.gradients.end(), gradient, gradient + 3);
+            }
+            if (baked.kind == ControlKind::kAffine) {
+                const auto shape = constrainGradient(gradient, static_cast<double>(item.mean),
+                                                     header_.superVoxelSize);
+                for (const float g : shape) {
+                    baked.shapes.push_back(varies ? g : 0.0f);
+                }
+            }
+            for (size_t k = 0; k < 8 && baked.kind == ControlKind::kTrilinear; ++k) {
+                baked.shapes.push_back(varies ? valueOf(corners_, entries[tables_.size() + k], c)
+                                              : item.mean);
             }
             baked.items.push_back(item);
             if (check_ == TRK_CHECK_FULL) {
@@ -211,10 +239,12 @@ class SidecarReader {
         }
     }
 
-    /// Index of the super-voxel at a place of local space.
-    static Int3 superVoxel(const Int3& local, int shift, const Int3& anchor) {
-        return {{(anchor[0] + local[0]) >> shift, (anchor[1] + local[1]) >> shift,
-                 (anchor[2] + local[2]) >> shift}};
+    /// Index, in the grids of super-voxels of 2^shift, of a place of local space.
+    Int3 gridIndex(const Int3& local, int shift, const Int3& anchor) const {
+        const Int3& origin = header_.origin;
+        return {{(anchor[0] + local[0] - origin[0]) >> shift,
+                 (anchor[1] + local[1] - origin[1]) >> shift,
+                 (anchor[2] + local[2] - origin[2]) >> shift}};
     }
 
     /// Local space has no negative coordinates; a grid that would need them belongs to another
@@ -253,7 +283,8 @@ class SidecarReader {
         if (metaText(*grid, "track_source_digest", place) != hexDigest(header_.digest)) {
             badSidecar(place, "comes from another bake than the file's other grids");
         }
-        const AffineMap expected = superVoxelMap(header_.indexToWorld, 1 << shift, offset);
+        const AffineMap expected =
+            superVoxelMap(header_.indexToWorld, header_.origin, 1 << shift, offset);
         if (!sameMap(expected, affineMap(grid->constTransform(), place))) {
             badSidecar(place, "does not lie over the file's control grid: its transform differs");
         }
@@ -266,7 +297,8 @@ class SidecarReader {
         return grid;
     }
 
-    static IntBox supportBox(const openvdb::GridBase& grid, int shift) {
+    /// In the source's index space.
+    IntBox supportBox(const openvdb::GridBase& grid, int shift) const {
         IntBox box;
         const openvdb::CoordBBox active = grid.evalActiveVoxelBoundingBox();
         if (!active.empty()) {
@@ -274,8 +306,8 @@ class SidecarReader {
             Int3 lo = toInt3(active.min());
             Int3 hi = toInt3(active.max());
             for (size_t a = 0; a < 3; ++a) {
-                lo[a] *= size;
-                hi[a] = (hi[a] + 1) * size;
+                lo[a] = lo[a] * size + header_.origin[a];
+                hi[a] = (hi[a] + 1) * size + header_.origin[a];
             }
             box.add(lo, hi);
         }
@@ -308,7 +340,7 @@ class SidecarReader {
         TreeRegions<TreeType> regions(tree);
         result.table.fill(
             [&](const Int3& local, int regionShift) -> std::optional<SparseTable::Entry> {
-                const Int3 at = superVoxel(local, shift, anchor);
+                const Int3 at = gridIndex(local, shift, anchor);
                 const auto region = regions.uniform(at, regionShift - shift);
                 if (!region) {
                     return std::nullopt;
@@ -373,6 +405,8 @@ class SidecarReader {
     VdbFile& file_;
     const SidecarHeader& header_;
     TrkCheck check_;
+    SidecarParts parts_;
+    bool hasGradients_;
     std::string prefix_;
     size_t channels_;
     std::vector<Statistic> statistics_;
@@ -384,15 +418,16 @@ class SidecarReader {
 
 }  // namespace
 
-Sidecar readSidecar(const std::string& path, const DensitySummary* density, TrkCheck check) {
+Sidecar readSidecar(const std::string& path, const DensitySummary* density, TrkCheck check,
+                    SidecarParts parts) {
     VdbFile file(path);
     Sidecar sidecar;
-    sidecar.header = readHeader(file);
+    sidecar.header = readHeader(file, density ? &density->grid : nullptr);
     if (density) {
         checkAgainst(sidecar.header, *density, check, path);
     }
     const Int3* anchor = density ? &density->anchor : nullptr;
-    SidecarReader(file, sidecar.header, check).read(anchor, sidecar);
+    SidecarReader(file, sidecar.header, check, parts).read(anchor, sidecar);
     return sidecar;
 }
 

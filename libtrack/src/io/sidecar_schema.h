@@ -15,8 +15,8 @@
 
 namespace trk::schema {
 
-constexpr int kFormatMajor = 1;
-constexpr const char* kFormat = "1.0";
+constexpr int kFormatMajor = 2;
+constexpr const char* kFormat = "2.0";
 constexpr const char* kInterpolation = "trilinear";
 
 constexpr const char* kControlSuffix = "_control";
@@ -42,9 +42,9 @@ inline std::vector<Statistic> statistics(ControlKind kind) {
     return list;
 }
 
-/// The grids of an affine control's gradients: one a channel of the source.
+/// The grids of gradients: one a channel of the source.
 inline std::vector<std::string> gradientSuffixes(size_t channels) {
-    const std::string name = "_control_gradient";
+    const std::string name = "_gradient";
     return channels == 1 ? std::vector<std::string>{name}
                          : std::vector<std::string>{name + "_r", name + "_g", name + "_b"};
 }
@@ -54,12 +54,20 @@ inline std::string vectorType(const std::string& valueType) {
     return valueType == "double" || valueType == "vec3d" ? "vec3d" : "vec3s";
 }
 
-inline std::string gridPrefix(const std::string& source) {
-    return source.empty() ? "density" : source;
+/// That the grids of a sidecar begin with: the source's name, with its index where that is one of
+/// several of that name; "density" for one without.
+inline std::string gridPrefix(const std::string& label) {
+    return label == "[0]"                     ? "density"
+           : label.empty() || label[0] == '[' ? "density" + label
+                                              : label;
 }
 
 inline std::string levelSuffix(int level) {
     return "_control_level_" + std::to_string(level);
+}
+
+inline std::string previewSuffix(int size) {
+    return "_preview_" + std::to_string(size);
 }
 
 inline std::string hexDigest(uint64_t digest) {
@@ -68,15 +76,33 @@ inline std::string hexDigest(uint64_t digest) {
     return text;
 }
 
-/// Where index i of a grid of super-voxels of `size` lies in source index space: size i + offset.
-/// Values of super-voxels lie at their centres, those of corners at the corners.
+/// The corner that the grids of a bake count from: that of `box` (index space), rounded down to a
+/// multiple of the coarsest level's super-voxels.
+inline Int3 originOf(const IntBox& box, int coarsestSize) {
+    Int3 origin{{0, 0, 0}};
+    if (!box.empty()) {
+        for (size_t a = 0; a < 3; ++a) {
+            origin[a] = box.lo[a] & ~(int64_t{coarsestSize} - 1);
+        }
+    }
+    return origin;
+}
+
+/// Where index i of a grid of super-voxels of `size` lies in source index space: origin + size i +
+/// offset. Values of super-voxels lie at their centres, those of corners at the corners.
 inline double centreOffset(int size) {
     return size / 2.0;
 }
 
-inline AffineMap superVoxelMap(const AffineMap& source, int size, double offset) {
+inline Vec3d placeOfFirst(const Int3& origin, double offset) {
+    return {{static_cast<double>(origin[0]) + offset, static_cast<double>(origin[1]) + offset,
+             static_cast<double>(origin[2]) + offset}};
+}
+
+inline AffineMap superVoxelMap(const AffineMap& source, const Int3& origin, int size,
+                               double offset) {
     AffineMap map = source;
-    const Vec3d shift = source.vector({{offset, offset, offset}});
+    const Vec3d shift = source.vector(placeOfFirst(origin, offset));
     for (int row = 0; row < 3; ++row) {
         for (int column = 0; column < 3; ++column) {
             map.linear[row][column] *= size;
@@ -86,14 +112,15 @@ inline AffineMap superVoxelMap(const AffineMap& source, int size, double offset)
     return map;
 }
 
-inline AffineMap sourceMap(const AffineMap& superVoxels, int size, double offset) {
+inline AffineMap sourceMap(const AffineMap& superVoxels, const Int3& origin, int size,
+                           double offset) {
     AffineMap map = superVoxels;
     for (auto& row : map.linear) {
         for (double& value : row) {
             value /= size;
         }
     }
-    const Vec3d shift = map.vector({{offset, offset, offset}});
+    const Vec3d shift = map.vector(placeOfFirst(origin, offset));
     for (int row = 0; row < 3; ++row) {
         map.translation[row] -= shift[row];
     }

@@ -30,10 +30,19 @@ void addMetadata(openvdb::GridBase& grid, const SidecarHeader& header) {
     text("track_source_grid", header.source.name);
     number("track_source_index", header.source.index);
     text("track_source_digest", hexDigest(header.digest));
+    grid.insertMeta("track_source_bytes",
+                    openvdb::Int64Metadata(static_cast<int64_t>(header.sourceBytes)));
+    grid.insertMeta("track_source_modified", openvdb::Int64Metadata(header.sourceModified));
+    grid.insertMeta("track_origin",
+                    openvdb::Vec3DMetadata(openvdb::Vec3d(static_cast<double>(header.origin[0]),
+                                                          static_cast<double>(header.origin[1]),
+                                                          static_cast<double>(header.origin[2]))));
     number("track_super_voxel_size", header.superVoxelSize);
     text("track_control", controlName(header.controlKind));
     text("track_interpolation", kInterpolation);
     number("track_levels", header.levels);
+    number("track_preview_size", header.previewSize);
+    grid.insertMeta("track_preview_scale", openvdb::DoubleMetadata(header.previewScale));
     if (header.repair & TRK_REPAIR_DROP_NONFINITE) {
         grid.insertMeta("track_dropped_nonfinite",
                         openvdb::Int64Metadata(static_cast<int64_t>(header.dropped)));
@@ -47,21 +56,22 @@ void addMetadata(openvdb::GridBase& grid, const SidecarHeader& header) {
 /// The values of an item of a table, as many as the grid's values have channels.
 using ValuesOf = std::function<const float*(size_t item)>;
 
-/// Index of an item's place in a grid of super-voxels.
-Int3 gridIndex(const Int3& local, const Int3& anchor, int itemShift) {
-    return {{(anchor[0] + local[0]) >> itemShift, (anchor[1] + local[1]) >> itemShift,
-             (anchor[2] + local[2]) >> itemShift}};
+/// Index of an item's place in a grid of super-voxels. `toGrid`: from local space to the corner
+/// that the grids count from.
+Int3 gridIndex(const Int3& local, const Int3& toGrid, int itemShift) {
+    return {{(toGrid[0] + local[0]) >> itemShift, (toGrid[1] + local[1]) >> itemShift,
+             (toGrid[2] + local[2]) >> itemShift}};
 }
 
 /// Sets the value of every occupied item and tile, active.
 template <class GridType>
-void fillItems(GridType& grid, const SparseTable& table, const Int3& anchor,
+void fillItems(GridType& grid, const SparseTable& table, const Int3& toGrid,
                const ValuesOf& valuesOf) {
     using Value = typename GridType::ValueType;
     auto accessor = grid.getAccessor();
     const int itemShift = table.itemShift();
     table.forEach([&](const Int3& lo, int shift, SparseTable::Entry entry) {
-        const openvdb::Coord at = toCoord(gridIndex(lo, anchor, itemShift));
+        const openvdb::Coord at = toCoord(gridIndex(lo, toGrid, itemShift));
         const auto value = fromFloats<Value>(valuesOf(SparseTable::index(entry)));
         if (shift == itemShift) {
             accessor.setValueOn(at, value);
@@ -74,12 +84,12 @@ void fillItems(GridType& grid, const SparseTable& table, const Int3& anchor,
 
 /// Sets the corner values of every occupied item and tile that are not 0; neighbours agree.
 template <class GridType>
-void fillCorners(GridType& grid, const BakedVolume& baked, const Int3& anchor) {
+void fillCorners(GridType& grid, const BakedVolume& baked, const Int3& toGrid) {
     using Value = typename GridType::ValueType;
     auto accessor = grid.getAccessor();
     const int itemShift = baked.table.itemShift();
     baked.table.forEach([&](const Int3& lo, int shift, SparseTable::Entry entry) {
-        const openvdb::Coord at = toCoord(gridIndex(lo, anchor, itemShift));
+        const openvdb::Coord at = toCoord(gridIndex(lo, toGrid, itemShift));
         const size_t item = SparseTable::index(entry) * baked.channels;
         for (size_t corner = 0; corner < 8; ++corner) {
             float floats[3];
@@ -105,7 +115,7 @@ void fillCorners(GridType& grid, const BakedVolume& baked, const Int3& anchor) {
 /// What all grids of one sidecar share.
 struct SidecarGrids {
     const SidecarHeader& header;
-    const Int3& anchor;
+    Int3 toGrid;
 
     /// A grid of super-voxels of `size`, filled by `fill(typed grid)`.
     template <class Fill>
@@ -116,9 +126,10 @@ struct SidecarGrids {
             fill(typed);
             openvdb::tools::prune(typed.tree());
         });
-        grid->setName(gridPrefix(header.source.name) + suffix);
+        grid->setName(gridPrefix(header.prefix) + suffix);
         grid->setGridClass(openvdb::GRID_FOG_VOLUME);
-        grid->setTransform(makeTransform(superVoxelMap(header.indexToWorld, size, offset)));
+        grid->setTransform(
+            makeTransform(superVoxelMap(header.indexToWorld, header.origin, size, offset)));
         addMetadata(*grid, header);
         return grid;
     }
@@ -127,27 +138,38 @@ struct SidecarGrids {
                                      const SparseTable& table, const ValuesOf& valuesOf) const {
         const int size = 1 << table.itemShift();
         return make(valueType, suffix, size, centreOffset(size),
-                    [&](auto& grid) { fillItems(grid, table, anchor, valuesOf); });
+                    [&](auto& grid) { fillItems(grid, table, toGrid, valuesOf); });
     }
 };
 
 }  // namespace
 
-void writeSidecar(const OutputFile& file, const SidecarHeader& header, const BakedVolume& baked,
+void writeSidecar(const OutputFile& file, SidecarHeader header, const BakedVolume& baked,
                   const Int3& anchor) {
     openvdb::initialize();
     const size_t channels = baked.channels;
     const std::vector<Statistic> list = statistics(baked.kind);
-    const std::vector<std::string> gradients = baked.kind == ControlKind::kAffine
-                                                   ? gradientSuffixes(channels)
-                                                   : std::vector<std::string>();
+    const std::vector<std::string> gradients = gradientSuffixes(channels);
     const size_t corners = baked.kind == ControlKind::kTrilinear ? 1 : 0;
-    VdbWriter writer(
-        file, static_cast<int32_t>(list.size() + gradients.size() + corners + baked.levels.size()));
-    const SidecarGrids grids{header, anchor};
+    const size_t previews = baked.previewSize > 0 ? 1 : 0;
+    header.levels = static_cast<int>(baked.levels.size());
+    header.previewSize = baked.previewSize;
+    IntBox box = baked.table.occupiedBox();
+    for (size_t a = 0; a < 3 && !box.empty(); ++a) {
+        box.lo[a] += anchor[a];
+        box.hi[a] += anchor[a];
+    }
+    header.origin = originOf(box, baked.superVoxelSize() << header.levels);
+    VdbWriter writer(file, static_cast<int32_t>(list.size() + gradients.size() + corners +
+                                                baked.levels.size() + previews));
+    Int3 toGrid{{0, 0, 0}};
+    for (size_t a = 0; a < 3; ++a) {
+        toGrid[a] = anchor[a] - header.origin[a];
+    }
+    const SidecarGrids grids{header, toGrid};
     if (corners > 0) {
         writer.add(grids.make(header.valueType, kControlSuffix, baked.superVoxelSize(), 0,
-                              [&](auto& grid) { fillCorners(grid, baked, anchor); }));
+                              [&](auto& grid) { fillCorners(grid, baked, toGrid); }));
     }
     std::vector<float> values(channels);
     for (const Statistic& statistic : list) {
@@ -159,8 +181,9 @@ void writeSidecar(const OutputFile& file, const SidecarHeader& header, const Bak
         }));
     }
     for (size_t c = 0; c < gradients.size(); ++c) {
-        const auto grid = grids.makeItems(vectorType(header.valueType), gradients[c], baked.table,
-                                          [&](size_t i) { return baked.shape(i * channels + c); });
+        const auto grid =
+            grids.makeItems(vectorType(header.valueType), gradients[c], baked.table,
+                            [&](size_t i) { return &baked.gradients[3 * (i * channels + c)]; });
         grid->setGridClass(openvdb::GRID_UNKNOWN);  // signed: no density
         writer.add(grid);
     }
@@ -169,6 +192,11 @@ void writeSidecar(const OutputFile& file, const SidecarHeader& header, const Bak
         writer.add(grids.makeItems(header.valueType, levelSuffix(static_cast<int>(level)),
                                    means.table,
                                    [&](size_t i) { return &means.values[i * channels]; }));
+    }
+    if (previews > 0) {
+        writer.add(grids.makeItems(header.valueType, previewSuffix(baked.previewSize),
+                                   baked.preview.table,
+                                   [&](size_t i) { return &baked.preview.values[i * channels]; }));
     }
     writer.finish();
 }

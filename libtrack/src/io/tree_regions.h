@@ -48,7 +48,7 @@ class TreeRegions {
 
     /// Value and state of the region of 2^shift voxels at `origin`, if it is known to be the same
     /// everywhere: no node divides it into different ones. A leaf counts as divided, and so does a
-    /// region that is not aligned with the tree's nodes; a single voxel never is.
+    /// region that meets one; a single voxel never is.
     std::optional<Region> uniform(const Int3& origin, int shift) {
         const Region nothing{tree_.background(), false};
         if (shift > kUpperShift) {  // may meet several of the root's regions: uniform only if empty
@@ -67,7 +67,7 @@ class TreeRegions {
         }
         const int64_t mask = (int64_t{1} << shift) - 1;
         if (((origin[0] | origin[1] | origin[2]) & mask) != 0) {
-            return std::nullopt;
+            return uniformAcross(origin, shift);
         }
         if (!inRange(origin)) {  // all of it is, as the limits are multiples of 4096
             return nothing;
@@ -93,6 +93,38 @@ class TreeRegions {
     }
 
   private:
+    /// The same for a region that is not aligned with nodes of its size: whether all that it meets,
+    /// of the next size that has nodes, is the same.
+    std::optional<Region> uniformAcross(const Int3& origin, int shift) {
+        const int64_t size = int64_t{1} << shift;
+        const int partShift = shift <= kLeafShift    ? 0
+                              : shift <= kLowerShift ? kLeafShift
+                                                     : kLowerShift;
+        if (partShift == 0) {
+            return std::nullopt;  // as soon asked voxel by voxel
+        }
+        // Where everything that it meets is one larger node's tile, that is soon seen.
+        std::optional<Region> expected;
+        const int64_t part = int64_t{1} << partShift;
+        Int3 first;
+        for (size_t a = 0; a < 3; ++a) {
+            first[a] = origin[a] & ~(part - 1);
+        }
+        for (Int3 at = first; at[0] < origin[0] + size; at[0] += part) {
+            for (at[1] = first[1]; at[1] < origin[1] + size; at[1] += part) {
+                for (at[2] = first[2]; at[2] < origin[2] + size; at[2] += part) {
+                    const auto found = uniform(at, partShift);
+                    if (!found || (expected && (!(found->value == expected->value) ||
+                                                found->active != expected->active))) {
+                        return std::nullopt;
+                    }
+                    expected = found;
+                }
+            }
+        }
+        return expected;
+    }
+
     using Upper = typename TreeType::RootNodeType::ChildNodeType;  // 4096^3 voxels
     using Lower = typename Upper::ChildNodeType;                   // 128^3 voxels
     static constexpr int kUpperShift = 12;

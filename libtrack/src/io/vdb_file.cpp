@@ -8,6 +8,7 @@
 #include <openvdb/io/Archive.h>
 #include <openvdb/io/GridDescriptor.h>
 #include <openvdb/io/io.h>
+#include <sys/stat.h>
 
 #include <algorithm>
 #include <cerrno>
@@ -274,6 +275,11 @@ std::string VdbEntry::label() const {
 VdbFile::VdbFile(const std::string& path) : path_(path) {
     openvdb::initialize();
     archive_ = std::make_unique<Archive>(path);
+    struct stat info = {};
+    if (stat(path.c_str(), &info) == 0) {
+        bytes_ = static_cast<uint64_t>(info.st_size);
+        modified_ = int64_t{info.st_mtim.tv_sec} * 1000000000 + info.st_mtim.tv_nsec;
+    }
     reading(path, [&] { archive_->readHead(path, entries_); });
     std::map<std::string, int> counts;
     for (VdbEntry& entry : entries_) {

@@ -37,6 +37,9 @@ class VdbFile {
     ~VdbFile();
 
     const std::string& path() const { return path_; }
+    uint64_t bytes() const { return bytes_; }
+    /// When it was written, in nanoseconds since 1970.
+    int64_t modified() const { return modified_; }
     const std::vector<VdbEntry>& entries() const { return entries_; }
 
     /// A grid without its voxels: metadata and transform. NULL for a type that is not registered.
@@ -55,6 +58,8 @@ class VdbFile {
     class Archive;
 
     std::string path_;
+    uint64_t bytes_ = 0;
+    int64_t modified_ = 0;
     std::vector<VdbEntry> entries_;
     std::unique_ptr<Archive> archive_;
 };

@@ -1,0 +1,85 @@
+// SPDX-License-Identifier: Apache-2.0
+#include "preview_scale.h"
+
+#include <algorithm>
+#include <array>
+#include <cmath>
+#include <vector>
+
+namespace vdbtools {
+namespace {
+
+using trk::ExtinctionField;
+using trk::LocalRay;
+using trk::Vec3d;
+
+/// Integral of the density (the mean over channels) along the line of an axis through a place,
+/// times the length of a voxel along it.
+double depthThrough(const ExtinctionField& field, const Vec3d& place, int axis, double voxel) {
+    LocalRay ray;
+    ray.origin = place;
+    const trk::IntBox& box = field.box();
+    for (int a = 0; a < 3; ++a) {
+        ray.direction[a] = a == axis ? 1 : 0;
+        ray.inverse[a] = a == axis ? 1 : 1e300;
+    }
+    ray.origin[axis] = static_cast<double>(box.lo[static_cast<size_t>(axis)]);
+    ray.tEnd = static_cast<double>(box.hi[static_cast<size_t>(axis)]) - ray.origin[axis];
+    uint64_t ignored = 0;
+    double sum = 0;
+    if (field.channels() == 1) {
+        sum = field.integrate<1>(ray, 0, ray.tEnd, ignored, ignored)[0];
+    } else {
+        for (const double d : field.integrate<3>(ray, 0, ray.tEnd, ignored, ignored)) {
+            sum += d / 3;
+        }
+    }
+    return sum * voxel;
+}
+
+double twoDigits(double value) {
+    const double unit = std::pow(10.0, std::floor(std::log10(value)) - 1);
+    return std::round(value / unit) * unit;
+}
+
+}  // namespace
+
+double previewScale(const ExtinctionField& field, const trk::AffineMap& indexToWorld) {
+    constexpr size_t kPlaces = 1024;
+    size_t count = 0;
+    field.table().forEach([&](const trk::Int3&, int, trk::SparseTable::Entry) { ++count; });
+    const size_t step = std::max<size_t>(1, count / kPlaces);
+    std::vector<double> depths;
+    size_t i = 0;
+    field.table().forEach([&](const trk::Int3& lo, int shift, trk::SparseTable::Entry) {
+        if (i++ % step != step / 2) {
+            return;
+        }
+        Vec3d centre;
+        for (int a = 0; a < 3; ++a) {
+            centre[a] = static_cast<double>(lo[static_cast<size_t>(a)]) + std::ldexp(0.5, shift);
+        }
+        for (int axis = 0; axis < 3; ++axis) {
+            const double depth =
+                depthThrough(field, centre, axis, length(indexToWorld.column(axis)));
+            if (depth > 0) {
+                depths.push_back(depth);
+            }
+        }
+    });
+    if (depths.empty()) {
+        return 1;
+    }
+    const auto middle = depths.begin() + static_cast<std::ptrdiff_t>(depths.size() / 2);
+    std::nth_element(depths.begin(), middle, depths.end());
+    constexpr double kShown = 3.2;  // -log(0.04)
+    // From a veil to a solid body, the volume's own scale is what its maker meant.
+    constexpr double kThinnest = 1.2;
+    constexpr double kThickest = 9;
+    if (*middle >= kThinnest && *middle <= kThickest) {
+        return 1;
+    }
+    return std::min(twoDigits(kShown / *middle), 1e37);  // it becomes a float
+}
+
+}  // namespace vdbtools

@@ -1,0 +1,15 @@
+// SPDX-License-Identifier: Apache-2.0
+// At which scale a volume shows well in a picture: a property of the volume alone.
+#pragma once
+
+#include "extinction_field.h"
+#include "geometry.h"
+
+namespace vdbtools {
+
+/// The scale (extinction over density) at which half of the axis-parallel lines through places of
+/// the volume let more than 4 % of the light through, with two digits; 1 where that shows the
+/// volume well, or it is empty. Neither super-voxels nor views matter.
+double previewScale(const trk::ExtinctionField& field, const trk::AffineMap& indexToWorld);
+
+}  // namespace vdbtools

@@ -45,7 +45,7 @@ void run(const Command& command, const std::vector<std::string>& given) {
         "control extinction of a super-voxel: constant (its mean), affine (mean and gradient) or "
         "trilinear (interpolated between corners, continuous)")(
         "levels", po::value<int>()->default_value(4),
-        "preview levels at most, 0 to 8, each of super-voxels twice as large, until two an axis "
+        "preview levels at most, 0 to 8, each of super-voxels twice as large, until four an axis "
         "hold "
         "everything")("force", po::bool_switch(), "replace an existing sidecar");
     addGridOptions(options);

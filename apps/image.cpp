@@ -3,10 +3,12 @@
 
 #include "failure.h"
 
+#include <ImathMatrix.h>
 #include <ImfChannelList.h>
 #include <ImfFrameBuffer.h>
 #include <ImfHeader.h>
 #include <ImfOutputFile.h>
+#include <ImfStandardAttributes.h>
 #include <ImfStringAttribute.h>
 #include <png.h>
 
@@ -36,44 +38,69 @@ float toneMap(float x) {
     return x;
 }
 
-uint8_t encodeSrgb(float linear) {
+float encodeSrgb(float linear) {
     const float x = std::fmin(std::fmax(linear, 0.0f), 1.0f);
-    const float s = x <= 0.0031308f ? 12.92f * x : 1.055f * std::pow(x, 1 / 2.4f) - 0.055f;
-    return static_cast<uint8_t>(std::lround(255 * s));
+    return x <= 0.0031308f ? 12.92f * x : 1.055f * std::pow(x, 1 / 2.4f) - 0.055f;
 }
 
-std::vector<uint8_t> encodePixels(const Image& image, Tone tone) {
-    std::vector<uint8_t> bytes(image.pixelCount() * 3);
-    const char* const names[] = {"R", "G", "B"};
-    for (size_t c = 0; c < 3; ++c) {
+/// A number in [0, 1) for a pixel, evenly spread over any neighbourhood [Jimenez 2014].
+float dither(size_t x, size_t y) {
+    const double t = 0.06711056 * static_cast<double>(x) + 0.00583715 * static_cast<double>(y);
+    const double scaled = 52.9829189 * (t - std::floor(t));
+    return static_cast<float>(scaled - std::floor(scaled));
+}
+
+std::vector<uint8_t> encodePixels(const Image& image, Tone tone, bool alpha) {
+    const size_t count = alpha ? 4 : 3;
+    std::vector<uint8_t> bytes(image.pixelCount() * count);
+    const char* const names[] = {"R", "G", "B", "A"};
+    const auto width = static_cast<size_t>(image.width);
+    for (size_t c = 0; c < count; ++c) {
         const std::vector<float>& channel = image.channels.at(names[c]);
         for (size_t i = 0; i < channel.size(); ++i) {
-            const float value = tone == Tone::kRolledOff ? toneMap(channel[i]) : channel[i];
-            bytes[3 * i + c] = encodeSrgb(value);
+            const float value =
+                tone == Tone::kRolledOff && c < 3 ? toneMap(channel[i]) : channel[i];
+            const float encoded =
+                c < 3 ? encodeSrgb(value) : std::fmin(std::fmax(value, 0.0f), 1.0f);
+            bytes[count * i + c] =
+                static_cast<uint8_t>(std::fmin(255 * encoded + dither(i % width, i / width), 255));
         }
     }
     return bytes;
 }
 
-png_image pngOf(const Image& image) {
+png_image pngOf(const Image& image, bool alpha) {
     png_image png;
     std::memset(&png, 0, sizeof(png));
     png.version = PNG_IMAGE_VERSION;
     png.width = static_cast<png_uint_32>(image.width);
     png.height = static_cast<png_uint_32>(image.height);
-    png.format = PNG_FORMAT_RGB;
+    png.format = alpha ? PNG_FORMAT_RGBA : PNG_FORMAT_RGB;
     return png;
 }
 
 }  // namespace
 
-void writeExr(const Image& image, const std::map<std::string, std::string>& attributes,
-              const trk::OutputFile& file) {
+void writeExr(const Image& image, bool half, const std::map<std::string, std::string>& attributes,
+              const CameraMatrices& matrices, const trk::OutputFile& file) {
     errno = 0;
     try {
         Imf::Header header(image.width, image.height);
         Imf::FrameBuffer frame;
+        Imf::addWorldToCamera(header, Imath::M44f(matrices.worldToCamera));
+        Imf::addWorldToNDC(header, Imath::M44f(matrices.worldToNdc));
+        std::map<std::string, std::vector<Imath::half>> halfs;
         for (const auto& [name, values] : image.channels) {
+            if (half && name.back() != 'Z') {
+                std::vector<Imath::half>& rounded = halfs[name];
+                rounded.assign(values.begin(), values.end());
+                header.channels().insert(name, Imf::Channel(Imf::HALF));
+                frame.insert(name,
+                             Imf::Slice(Imf::HALF, reinterpret_cast<char*>(rounded.data()),
+                                        sizeof(Imath::half),
+                                        sizeof(Imath::half) * static_cast<size_t>(image.width)));
+                continue;
+            }
             header.channels().insert(name, Imf::Channel(Imf::FLOAT));
             // OpenEXR's slices are for reading too, hence not const; writing leaves them alone.
             char* base = const_cast<char*>(reinterpret_cast<const char*>(values.data()));
@@ -92,9 +119,9 @@ void writeExr(const Image& image, const std::map<std::string, std::string>& attr
     }
 }
 
-void writePng(const Image& image, Tone tone, const trk::OutputFile& file) {
-    const std::vector<uint8_t> bytes = encodePixels(image, tone);
-    png_image png = pngOf(image);
+void writePng(const Image& image, Tone tone, const trk::OutputFile& file, bool alpha) {
+    const std::vector<uint8_t> bytes = encodePixels(image, tone, alpha);
+    png_image png = pngOf(image, alpha);
     errno = 0;
     if (!png_image_write_to_file(&png, file.path().c_str(), 0, bytes.data(), 0, nullptr)) {
         cannotWrite(file, errno ? std::strerror(errno) : png.message);
@@ -102,8 +129,8 @@ void writePng(const Image& image, Tone tone, const trk::OutputFile& file) {
 }
 
 std::string pngUri(const Image& image, Tone tone) {
-    const std::vector<uint8_t> pixels = encodePixels(image, tone);
-    png_image png = pngOf(image);
+    const std::vector<uint8_t> pixels = encodePixels(image, tone, false);
+    png_image png = pngOf(image, false);
     png_alloc_size_t size = PNG_IMAGE_PNG_SIZE_MAX(png);
     std::vector<uint8_t> bytes(size);
     if (!png_image_write_to_memory(&png, bytes.data(), &size, 0, pixels.data(), 0, nullptr)) {

@@ -25,15 +25,24 @@ struct Image {
     }
 };
 
-/// Writes every channel as 32-bit float, with text attributes. Does not commit. Throws trk::Error.
-void writeExr(const Image& image, const std::map<std::string, std::string>& attributes,
-              const trk::OutputFile& file);
+/// Where a picture's camera stands: from world space to the camera's (x right, y up, looking along
+/// -z), and to the picture's, for row vectors [in][out].
+struct CameraMatrices {
+    float worldToCamera[4][4];
+    float worldToNdc[4][4];
+};
+
+/// Writes every channel as 32-bit float, or, with `half`, all but depths (…Z) as 16-bit, with text
+/// attributes and the standard ones of the camera. Does not commit. Throws trk::Error.
+void writeExr(const Image& image, bool half, const std::map<std::string, std::string>& attributes,
+              const CameraMatrices& matrices, const trk::OutputFile& file);
 
 /// How a PNG shows linear values: as they are, or with the highlights rolled off.
 enum class Tone { kLinear, kRolledOff };
 
-/// Writes channels R, G, B, sRGB encoded, 8 bit. Does not commit. Throws trk::Error.
-void writePng(const Image& image, Tone tone, const trk::OutputFile& file);
+/// Writes channels R, G, B, and with `alpha` A, sRGB encoded, 8 bit, dithered so that smooth
+/// gradients show no bands. Does not commit. Throws trk::Error.
+void writePng(const Image& image, Tone tone, const trk::OutputFile& file, bool alpha = false);
 
 /// The same as a "data:" URI, for pages that hold their pictures.
 std::string pngUri(const Image& image, Tone tone);

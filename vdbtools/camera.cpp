@@ -40,11 +40,12 @@ TrkRay Camera::ray(double x, double y, double aspect) const {
     return ray;
 }
 
-Camera Camera::orbited(const Vec3d& centre, double angle) const {
+Camera Camera::orbited(UpAxis axis, const Vec3d& centre, double angle) const {
     const double c = std::cos(angle);
     const double s = std::sin(angle);
-    const auto turn = [c, s](const Vec3d& v) {
-        return Vec3d{{c * v[0] + s * v[2], v[1], c * v[2] - s * v[0]}};
+    const auto turn = [&](const Vec3d& world) {
+        const Vec3d v = fromWorld(axis, world);
+        return toWorld(axis, {{c * v[0] + s * v[2], v[1], c * v[2] - s * v[0]}});
     };
     Camera turned = *this;
     turned.eye = centre + turn(eye - centre);
@@ -54,28 +55,52 @@ Camera Camera::orbited(const Vec3d& centre, double angle) const {
     return turned;
 }
 
+trk::AffineMap Camera::worldToCamera() const {
+    trk::AffineMap map;
+    const Vec3d rows[3] = {right, up, -1.0 * forward};
+    for (int row = 0; row < 3; ++row) {
+        for (int column = 0; column < 3; ++column) {
+            map.linear[row][column] = rows[row][column];
+        }
+        map.translation[row] = -dot(rows[row], eye);
+    }
+    return map;
+}
+
+Vec3d toWorld(UpAxis up, const Vec3d& v) {
+    return up == UpAxis::kY ? v : Vec3d{{v[0], -v[2], v[1]}};
+}
+
+Vec3d fromWorld(UpAxis up, const Vec3d& v) {
+    return up == UpAxis::kY ? v : Vec3d{{v[0], v[2], -v[1]}};
+}
+
 const std::vector<std::string>& viewNames() {
     static const std::vector<std::string> names{"front", "side", "top", "iso"};
     return names;
 }
 
-Camera namedView(const std::string& view) {
+Camera namedView(const std::string& view, UpAxis up) {
+    const auto looking = [up](const Vec3d& forward, const Vec3d& roughlyUp) {
+        return look(toWorld(up, forward), toWorld(up, roughlyUp));
+    };
     const Vec3d y{{0, 1, 0}};
     if (view == "front") {
-        return look({{0, 0, -1}}, y);
+        return looking({{0, 0, -1}}, y);
     }
     if (view == "side") {
-        return look({{-1, 0, 0}}, y);
+        return looking({{-1, 0, 0}}, y);
     }
     if (view == "top") {
-        return look({{0, -1, 0}}, {{0, 0, -1}});
+        return looking({{0, -1, 0}}, {{0, 0, -1}});
     }
-    return look({{-1, -0.62, -1}}, y);
+    return looking({{-1, -0.62, -1}}, y);
 }
 
-Camera cameraAt(const Vec3d& eye, const Vec3d& target, double fov) {
+Camera cameraAt(const Vec3d& eye, const Vec3d& target, double fov, UpAxis up) {
     const Vec3d unit = normalized(target - eye);
-    Camera camera = look(unit, std::fabs(unit[1]) > 0.999 ? Vec3d{{0, 0, -1}} : Vec3d{{0, 1, 0}});
+    const bool steep = std::fabs(fromWorld(up, unit)[1]) > 0.999;
+    Camera camera = look(unit, toWorld(up, steep ? Vec3d{{0, 0, -1}} : Vec3d{{0, 1, 0}}));
     camera.eye = eye;
     camera.tangent = std::tan(fov * kPi / 360);
     return camera;

@@ -10,7 +10,15 @@
 
 namespace vdbtools {
 
-/// A camera in world space; y is up.
+/// Which axis of world space points up.
+enum class UpAxis { kY, kZ };
+
+/// A direction given with y up and z towards the front, as one of world space, and back. With z up,
+/// the front is at -y.
+trk::Vec3d toWorld(UpAxis up, const trk::Vec3d& v);
+trk::Vec3d fromWorld(UpAxis up, const trk::Vec3d& v);
+
+/// A camera in world space.
 struct Camera {
     trk::Vec3d eye;
     trk::Vec3d right;  // of unit length, like the other two
@@ -23,15 +31,19 @@ struct Camera {
     TrkRay ray(double x, double y, double aspect) const;
 
     /// The camera turned by an angle (radians) around the vertical through `centre`.
-    Camera orbited(const trk::Vec3d& centre, double angle) const;
+    Camera orbited(UpAxis up, const trk::Vec3d& centre, double angle) const;
+
+    /// From world space to the camera's: x right, y up, the camera at 0 looking along -z.
+    trk::AffineMap worldToCamera() const;
 };
 
-/// "front" looks along -z, "side" along -x, "top" along -y, "iso" along all three.
+/// "front" looks at the front, "side" along -x, "top" down, "iso" along all three.
 const std::vector<std::string>& viewNames();
-Camera namedView(const std::string& view);
+Camera namedView(const std::string& view, UpAxis up = UpAxis::kY);
 
 /// A camera at `eye` that looks at `target`. `fov`: vertical field of view in degrees.
-Camera cameraAt(const trk::Vec3d& eye, const trk::Vec3d& target, double fov);
+Camera cameraAt(const trk::Vec3d& eye, const trk::Vec3d& target, double fov,
+                UpAxis up = UpAxis::kY);
 
 /// A box in world space.
 struct WorldBox {

@@ -9,6 +9,7 @@
 #include <cstddef>
 #include <map>
 #include <optional>
+#include <utility>
 
 namespace vdbtools {
 namespace {
@@ -146,14 +147,14 @@ int64_t largestExtent(const trk::IntBox& box) {
 
 /// Bytes of a sidecar without means for pictures: a grid's nodes, which VDB does not compress, and
 /// its values, which compress little.
+constexpr double kGridBytes = 10500;
 double estimatedBytes(const trk::BakedVolume& baked) {
-    constexpr double kGrid = 10500;
     constexpr double kValue = 4.2;
     const double statistics = baked.kind == trk::ControlKind::kConstant ? 5 : 7;
     const auto channels = static_cast<double>(baked.channels);
     const double grids = statistics + channels + static_cast<double>(baked.levels.size());
-    return kGrid * grids + kValue * channels * (statistics + 3 + 0.15) *
-                               static_cast<double>(baked.items.size() / baked.channels);
+    return kGridBytes * grids + kValue * channels * (statistics + 3 + 0.15) *
+                                    static_cast<double>(baked.items.size() / baked.channels);
 }
 
 }  // namespace
@@ -163,7 +164,7 @@ void addLevels(trk::BakedVolume& baked, const trk::IntBox& box, int count) {
     for (int i = 0; i < count; ++i) {
         const SparseTable& finer = i == 0 ? baked.table : baked.levels.back().table;
         const int64_t size = int64_t{1} << finer.itemShift();
-        if (largestExtent(finer.occupiedBox()) <= 2 * size) {
+        if (largestExtent(finer.occupiedBox()) <= 4 * size) {
             return;
         }
         baked.levels.push_back(nextLevel(finer, box, channels, [&](size_t item, size_t c) {
@@ -176,15 +177,23 @@ void addLevels(trk::BakedVolume& baked, const trk::IntBox& box, int count) {
 void addPreview(trk::BakedVolume& baked, const ExtinctionField& field, uint64_t sidecarBytes) {
     constexpr int64_t kFinest =
         160;                       // cubes along the longest edge: about three pixels of 512 each
-    constexpr double kCube = 4.4;  // bytes a channel, of values and their nodes
-    const double room = 0.9 * (static_cast<double>(sidecarBytes) - estimatedBytes(baked)) - 10500;
+    constexpr double kCube = 4.8;  // bytes a channel, of values and their nodes
+    const double room = static_cast<double>(sidecarBytes) - estimatedBytes(baked) - kGridBytes;
+    const auto bytesOf = [&](double cubes) {
+        return kCube * cubes * static_cast<double>(field.channels());
+    };
     const int64_t extent = largestExtent(field.box());
     for (int shift = 0; shift < baked.superVoxelShift; ++shift) {
-        const double cubes = static_cast<double>(field.brickCount()) * std::pow(8.0, 3.0 - shift);
-        if (extent >> shift <= kFinest &&
-            kCube * cubes * static_cast<double>(field.channels()) <= room) {
+        // Bricks may hold much emptiness, but not so much.
+        const double most = static_cast<double>(field.brickCount()) *
+                            std::pow(8.0, ExtinctionField::kBrickShift - shift);
+        if (extent >> shift > kFinest || bytesOf(most / 4) > room) {
+            continue;
+        }
+        ValueTable means = meansOf(field, shift);
+        if (bytesOf(static_cast<double>(means.table.occupiedItems())) <= room) {
             baked.previewSize = 1 << shift;
-            baked.preview = meansOf(field, shift);
+            baked.preview = std::move(means);
             return;
         }
     }

@@ -10,8 +10,8 @@
 
 namespace vdbtools {
 
-/// Adds levels to a bake of a field that lies in `box` (cells): `count`, or fewer where two
-/// super-voxels an axis hold everything (which may be as few as there can be, with 0 in the middle).
+/// Adds levels to a bake of a field that lies in `box` (cells): `count`, or fewer where four
+/// super-voxels an axis hold everything: coarser ones save a ray nothing.
 void addLevels(trk::BakedVolume& baked, const trk::IntBox& box, int count);
 
 /// Adds means of cubes smaller than super-voxels, where the latter are too large for a picture: as

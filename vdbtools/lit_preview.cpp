@@ -26,18 +26,20 @@ namespace {
 using Color = std::array<double, 3>;
 
 // A clear late afternoon. Radiances are relative; a white surface in the sun would be about 1.
-constexpr double kTowardsSun[3] = {-0.36, 0.66, 0.66};
 constexpr Color kSun{{0.98, 0.89, 0.74}};  // already over 4 pi, the isotropic phase function
 constexpr Color kZenith{{0.30, 0.48, 0.86}};
 constexpr Color kHorizon{{0.62, 0.72, 0.84}};
 constexpr Color kGround{{0.24, 0.21, 0.18}};
 constexpr int kSkyDirections = 20;
+constexpr int kSunDirections = 5;
+constexpr double kSunRadius = 5;  // degrees
 // In super-voxels. A place's own super-voxel is left out of its shadow: the light is tabulated
 // where the interpolated control is largest, and would show the grid of those places as dark dots.
 constexpr double kShadowStart = 1;
+constexpr int kShadowSteps = 1;
 
-Color skyRadiance(const Vec3d& direction) {
-    const double height = direction[1];
+/// `height`: of a direction of unit length.
+Color skyRadiance(double height) {
     Color radiance;
     for (size_t k = 0; k < 3; ++k) {
         radiance[k] =
@@ -46,68 +48,23 @@ Color skyRadiance(const Vec3d& direction) {
     return radiance;
 }
 
-/// Light from one direction.
-struct Source {
-    Vec3d towards;
-    Color radiance;
-};
-
-/// The sun, and the sky as directions spread evenly over the sphere.
-std::vector<Source> makeSources() {
-    std::vector<Source> sources;
-    const Vec3d sun{{kTowardsSun[0], kTowardsSun[1], kTowardsSun[2]}};
-    sources.push_back({(1 / length(sun)) * sun, kSun});
-    for (int i = 0; i < kSkyDirections; ++i) {
-        const double y = 1 - (2 * i + 1.0) / kSkyDirections;
-        const double angle = 2.39996322972865332 * i;  // the golden angle
-        const double r = std::sqrt(1 - y * y);
-        const Vec3d towards{{r * std::cos(angle), y, r * std::sin(angle)}};
-        Color radiance = skyRadiance(towards);
-        for (double& c : radiance) {
-            c /= kSkyDirections;
-        }
-        sources.push_back({towards, radiance});
-    }
-    return sources;
-}
-
-const std::vector<Source>& sources() {
-    static const std::vector<Source> list = makeSources();
-    return list;
-}
-
-/// What is behind the volume, by the height in the picture: a sky that tells little of its own.
-Color backdrop(double y) {
-    Color color;
-    for (size_t k = 0; k < 3; ++k) {
-        const double top[3] = {0.10, 0.22, 0.48};
-        const double bottom[3] = {0.42, 0.54, 0.68};
-        color[k] = top[k] + (bottom[k] - top[k]) * y;
-    }
-    return color;
-}
-
-trk::VolumeOptions volumeOptions(const trk::SidecarHeader& header, uint32_t level, float scale,
-                                 const std::array<float, 3>& color) {
+trk::Volume openLevel(const std::string& path, const LitOptions& lit) {
     using namespace trk::schema;
+    const trk::SidecarHeader header = trk::readSidecarHeader(path);
+    if (lit.level && *lit.level > static_cast<uint32_t>(header.levels)) {
+        throw trk::Error(TRK_ERROR_INVALID_ARGUMENT,
+                         path + ": level " + std::to_string(*lit.level) + ": expected 0 to " +
+                             std::to_string(header.levels) + ", the levels of this sidecar");
+    }
     trk::VolumeOptions options;
     options.gridNamed = true;
     options.gridName =
-        header.prefix + (level == 0 ? kControlSuffix : levelSuffix(static_cast<int>(level)));
-    options.scale = scale;
-    options.color = color;
-    return options;
-}
-
-trk::Volume openLevel(const std::string& path, uint32_t level, float scale,
-                      const std::array<float, 3>& color) {
-    const trk::SidecarHeader header = trk::readSidecarHeader(path);
-    if (level > static_cast<uint32_t>(header.levels)) {
-        throw trk::Error(TRK_ERROR_INVALID_ARGUMENT,
-                         path + ": level " + std::to_string(level) + ": expected 0 to " +
-                             std::to_string(header.levels) + ", the levels of this sidecar");
-    }
-    return trk::openVolume(path.c_str(), "", volumeOptions(header, level, scale, color));
+        header.prefix + (lit.level.value_or(0) > 0 ? levelSuffix(static_cast<int>(*lit.level))
+                         : !lit.level && header.previewSize > 0 ? previewSuffix(header.previewSize)
+                                                                : kControlSuffix);
+    options.scale = lit.scale;
+    options.color = lit.color;
+    return trk::openVolume(path.c_str(), "", options);
 }
 
 /// In how many stretches a cell, or a constant region, is lit: more where much is absorbed, as most
@@ -118,6 +75,31 @@ int stretchCount(double length, double depth) {
     const double byDepth = depth < 0.02 ? 1 : depth < 0.3 ? 4 : 8;
     return static_cast<int>(std::min(std::max(byDepth, std::ceil(length - 1)), kMost));
 }
+
+/// How the depth grows along a line through a cell, where the density is a cubic in s from 0 to 1.
+/// To take it for linear between its ends, which may be 0 both, draws the cells' edges.
+class DepthInCell {
+  public:
+    template <class Density>
+    explicit DepthInCell(const Density& at) {
+        const double y[4] = {at(0), at(1.0 / 3), at(2.0 / 3), at(1)};
+        // Coefficients of the cubic through four points at thirds, integrated term by term.
+        term_[0] = y[0];
+        term_[1] = (-5.5 * y[0] + 9 * y[1] - 4.5 * y[2] + y[3]) / 2;
+        term_[2] = (9 * y[0] - 22.5 * y[1] + 18 * y[2] - 4.5 * y[3]) / 3;
+        term_[3] = (-4.5 * y[0] + 13.5 * y[1] - 13.5 * y[2] + 4.5 * y[3]) / 4;
+        whole_ = term_[0] + term_[1] + term_[2] + term_[3];
+    }
+    /// The part of the cell's depth that lies before s.
+    double share(double s) const {
+        const double depth = s * (term_[0] + s * (term_[1] + s * (term_[2] + s * term_[3])));
+        return whole_ > 0 ? std::min(std::max(depth / whole_, 0.0), 1.0) : s;
+    }
+
+  private:
+    double term_[4];
+    double whole_;
+};
 
 /// Whether the light at a vertex of a brick is ever looked up: a cell beside it holds something. In
 /// constant regions it always is.
@@ -145,10 +127,52 @@ bool isNeeded(const ExtinctionField& field, SparseTable::Entry entry, const Int3
 
 }  // namespace
 
-LitPreview::LitPreview(const std::string& sidecarPath, uint32_t level, float scale,
-                       const std::array<float, 3>& color)
-    : volume_(openLevel(sidecarPath, level, scale, color)) {
+std::array<float, 3> skyBehind(double y) {
+    std::array<float, 3> color{};
+    for (size_t k = 0; k < 3; ++k) {
+        const double top[3] = {0.10, 0.22, 0.48};
+        const double bottom[3] = {0.42, 0.54, 0.68};
+        color[k] = static_cast<float>(top[k] + (bottom[k] - top[k]) * y);
+    }
+    return color;
+}
+
+LitPreview::LitPreview(const std::string& sidecarPath, const LitOptions& options)
+    : sources_(makeSources(options)), volume_(openLevel(sidecarPath, options)) {
     tabulateLight();
+}
+
+/// The sun, and the sky as directions spread evenly over the sphere.
+std::vector<LitPreview::Source> LitPreview::makeSources(const LitOptions& options) {
+    constexpr double kDegree = 3.14159265358979323846 / 180;
+    std::vector<Source> list;
+    // A wide sun, as several directions: from one alone, its shadows would show the grid of the
+    // places that light is computed for.
+    for (int i = 0; i < kSunDirections; ++i) {
+        const double turn = 2 * kDegree * 180 * i / kSunDirections;
+        const double azimuth = kDegree * (options.azimuth + kSunRadius * std::cos(turn));
+        const double elevation = kDegree * (options.elevation + kSunRadius * std::sin(turn));
+        Color radiance = kSun;
+        for (double& c : radiance) {
+            c /= kSunDirections;
+        }
+        list.push_back(
+            {toWorld(options.up, {{std::cos(elevation) * std::sin(azimuth), std::sin(elevation),
+                                   std::cos(elevation) * std::cos(azimuth)}}),
+             radiance});
+    }
+    for (int i = 0; i < kSkyDirections; ++i) {
+        const double y = 1 - (2 * i + 1.0) / kSkyDirections;
+        const double angle = 2.39996322972865332 * i;  // the golden angle
+        const double r = std::sqrt(1 - y * y);
+        Color radiance = skyRadiance(y);
+        for (double& c : radiance) {
+            c /= kSkyDirections;
+        }
+        list.push_back(
+            {toWorld(options.up, {{r * std::cos(angle), y, r * std::sin(angle)}}), radiance});
+    }
+    return list;
 }
 
 /// All light that arrives at a place, through what of the volume is in its way.
@@ -162,7 +186,7 @@ LitPreview::Light LitPreview::computeLight(const Vec3d& local) const {
     trk::withVariant(volume_, trk::ControlKind::kConstant, [&](auto variant) {
         using V = decltype(variant);
         const typename V::Extinction extinction(volume_);
-        for (const Source& source : sources()) {
+        for (const Source& source : sources_) {
             TrkRay ray;
             for (int a = 0; a < 3; ++a) {
                 ray.origin[a] = static_cast<float>(world[a]);
@@ -172,10 +196,18 @@ LitPreview::Light LitPreview::computeLight(const Vec3d& local) const {
             ray.tMax = std::numeric_limits<float>::infinity();
             std::array<double, V::kChannels> depth{};
             const auto clipped = volume_.clip(ray, volume_.field->box());
-            if (clipped && clipped->local.tEnd > kShadowStart) {
-                uint64_t ignored = 0;
-                depth = extinction.integrate(clipped->local, kShadowStart, clipped->local.tEnd,
-                                             ignored, ignored);
+            for (int i = 0; clipped && i <= kShadowSteps; ++i) {
+                const double from = kShadowStart + i;
+                const double to = i < kShadowSteps ? std::min(from + 1, clipped->local.tEnd)
+                                                   : clipped->local.tEnd;
+                if (from < to) {
+                    uint64_t ignored = 0;
+                    const auto part =
+                        extinction.integrate(clipped->local, from, to, ignored, ignored);
+                    for (size_t c = 0; c < V::kChannels; ++c) {
+                        depth[c] += (i + 1.0) / (kShadowSteps + 1) * part[c];
+                    }
+                }
             }
             const double lengthPerVoxel = clipped ? clipped->lengthPerVoxel : 0.0;
             for (size_t k = 0; k < 3; ++k) {
@@ -275,11 +307,12 @@ LitPreview::Light LitPreview::lightAt(const Vec3d& local) const {
     return light;
 }
 
-void LitPreview::drawPixel(const TrkRay& ray, Picture& picture, size_t pixel) const {
+void LitPreview::drawPixel(const TrkRay& ray, double farDepth, Picture& picture,
+                           size_t pixel) const {
     constexpr double kOpaque = 1e-5;
     Color radiance{};
     Color transmittance{{1, 1, 1}};
-    double halfDepth = std::numeric_limits<double>::infinity();
+    double halfDepth = farDepth;
     trk::withVariant(volume_, trk::ControlKind::kConstant, [&](auto variant) {
         using V = decltype(variant);
         const auto clipped = volume_.clip(ray, volume_.field->box());
@@ -332,20 +365,16 @@ void LitPreview::drawPixel(const TrkRay& ray, Picture& picture, size_t pixel) co
                     return true;
                 }
                 const auto count = stretchCount(t1 - t0, most);
-                // The density at the ends says how the depth grows in between: all but linearly.
-                const double d0 = count > 1 ? densityAt(local.at(t0)) : 1;
-                const double d1 = count > 1 ? densityAt(local.at(t1)) : 1;
+                const DepthInCell depthIn(
+                    [&](double s) { return densityAt(local.at(t0 + s * (t1 - t0))); });
                 double from = 0;  // shares of the length, and of the depth
                 double depthFrom = 0;
                 for (int i = 1; i <= count; ++i) {
-                    const double to = std::pow(static_cast<double>(i) / count, 2);
-                    const double depthTo =
-                        i == count || !(d0 + d1 > 0)
-                            ? to
-                            : std::min((2 * d0 * to + (d1 - d0) * to * to) / (d0 + d1), 1.0);
+                    const double to = static_cast<double>(i) / count;
+                    const double depthTo = i == count ? 1 : depthIn.share(to);
                     std::array<double, V::kChannels> passed;
                     for (size_t c = 0; c < V::kChannels; ++c) {
-                        passed[c] = std::exp(-depth[c] * (depthTo - depthFrom));
+                        passed[c] = std::exp(-depth[c] * std::max(depthTo - depthFrom, 0.0));
                     }
                     addStretch(t0 + from * (t1 - t0), t0 + to * (t1 - t0), passed);
                     from = to;
@@ -354,13 +383,74 @@ void LitPreview::drawPixel(const TrkRay& ray, Picture& picture, size_t pixel) co
                 return std::max({transmittance[0], transmittance[1], transmittance[2]}) > kOpaque;
             });
     });
-    const size_t row = pixel / static_cast<size_t>(picture.width);
-    const Color behind = backdrop((static_cast<double>(row) + 0.5) / picture.height);
     for (size_t k = 0; k < 3; ++k) {
         picture.transmittance[k][pixel] = static_cast<float>(transmittance[k]);
-        picture.beauty[k][pixel] = static_cast<float>(radiance[k] + transmittance[k] * behind[k]);
+        picture.light[k][pixel] = static_cast<float>(radiance[k]);
     }
     picture.halfDepth[pixel] = static_cast<float>(halfDepth);
+}
+
+WorldBox LitPreview::box() const {
+    const ExtinctionField& field = *volume_.field;
+    trk::IntBox content;
+    field.table().forEach([&](const Int3& lo, int shift, SparseTable::Entry entry) {
+        const int64_t size = int64_t{1} << shift;
+        if (ExtinctionField::isConstant(entry)) {
+            content.add(lo, {{lo[0] + size, lo[1] + size, lo[2] + size}});
+            return;
+        }
+        constexpr auto kEdge = static_cast<size_t>(ExtinctionField::kBrickEdge);
+        for (size_t i = 0; i < ExtinctionField::kBrickVertices; ++i) {
+            for (size_t c = 0; c < field.channels(); ++c) {
+                if (field.vertex(entry, i, c) > 0) {
+                    const Int3 at{{lo[0] + static_cast<int64_t>(i / (kEdge * kEdge)),
+                                   lo[1] + static_cast<int64_t>(i / kEdge % kEdge),
+                                   lo[2] + static_cast<int64_t>(i % kEdge)}};
+                    content.add({{at[0] - 1, at[1] - 1, at[2] - 1}},
+                                {{at[0] + 1, at[1] + 1, at[2] + 1}});
+                }
+            }
+        }
+    });
+    WorldBox result;
+    trk::worldBounds(volume_.indexToWorld, volume_.anchor, content, result.lo.x, result.hi.x);
+    return result;
+}
+
+std::vector<char> LitPreview::hits(const Camera& camera, int width, int height) const {
+    std::vector<char> result(static_cast<size_t>(width) * static_cast<size_t>(height));
+    const double aspect = static_cast<double>(width) / height;
+    trk::parallelFor(result.size(), 64, [&](size_t i) {
+        const auto row = static_cast<double>(i / static_cast<size_t>(width));
+        const auto column = static_cast<double>(i % static_cast<size_t>(width));
+        const auto clipped = volume_.clip(
+            camera.ray((column + 0.5) / width, (row + 0.5) / height, aspect), volume_.field->box());
+        trk::withVariant(volume_, trk::ControlKind::kConstant, [&](auto variant) {
+            using V = decltype(variant);
+            if (clipped) {
+                uint64_t ignored = 0;
+                for (const double depth : typename V::Extinction(volume_).integrate(
+                         clipped->local, 0, clipped->local.tEnd, ignored, ignored)) {
+                    result[i] = result[i] || clipped->lengthPerVoxel * depth > 1e-3;
+                }
+            }
+        });
+    });
+    return result;
+}
+
+/// The distance of the farthest corner of the volume's box.
+double LitPreview::farSide(const Camera& camera) const {
+    const WorldBox content = box();
+    double farthest = 0;
+    for (int corner = 0; corner < 8; ++corner) {
+        Vec3d p;
+        for (int a = 0; a < 3; ++a) {
+            p[a] = corner >> a & 1 ? content.hi[a] : content.lo[a];
+        }
+        farthest = std::max(farthest, length(p - camera.eye));
+    }
+    return farthest;
 }
 
 Picture LitPreview::draw(const Camera& camera, int width, int height,
@@ -370,17 +460,18 @@ Picture LitPreview::draw(const Camera& camera, int width, int height,
     picture.height = height;
     const size_t pixels = static_cast<size_t>(width) * static_cast<size_t>(height);
     for (size_t k = 0; k < 3; ++k) {
-        picture.beauty[k].resize(pixels);
+        picture.light[k].resize(pixels);
         picture.transmittance[k].resize(pixels);
     }
     picture.halfDepth.resize(pixels);
     const double aspect = static_cast<double>(width) / height;
+    const double farDepth = farSide(camera);
     std::atomic<int> done{0};
     trk::parallelFor(static_cast<size_t>(height), 4, [&](size_t i) {
         const int row = static_cast<int>(i);
         for (int column = 0; column < width; ++column) {
-            drawPixel(camera.ray((column + 0.5) / width, (row + 0.5) / height, aspect), picture,
-                      i * static_cast<size_t>(width) + static_cast<size_t>(column));
+            drawPixel(camera.ray((column + 0.5) / width, (row + 0.5) / height, aspect), farDepth,
+                      picture, i * static_cast<size_t>(width) + static_cast<size_t>(column));
         }
         progress(static_cast<double>(++done) / height);
     });

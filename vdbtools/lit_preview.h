@@ -9,6 +9,7 @@
 #include <array>
 #include <cstdint>
 #include <functional>
+#include <optional>
 #include <string>
 #include <vector>
 
@@ -18,11 +19,28 @@ namespace vdbtools {
 struct Picture {
     int width = 0;
     int height = 0;
-    std::vector<float> beauty[3];         ///< in front of a sky
+    std::vector<float> light[3];          ///< that the volume scatters to the camera
     std::vector<float> transmittance[3];  ///< of the camera ray; equal where the volume is grey
-    /// Distance from the camera at which half the light is left (the mean over channels), or
-    /// infinity.
+    /// Distance from the camera at which half the light is left (the mean over channels); where
+    /// more is left to the end, that of the volume's far side.
     std::vector<float> halfDepth;
+};
+
+/// The radiance of the sky that pictures have behind the volume, by the height in the picture: from
+/// 0 (top) to 1. It tells little of its own.
+std::array<float, 3> skyBehind(double y);
+
+/// What is drawn, and how it is lit.
+struct LitOptions {
+    /// 0: the baked control, k: super-voxels 2^k times as large; nothing: the finest means the
+    /// sidecar has.
+    std::optional<uint32_t> level;
+    float scale = 1;
+    std::array<float, 3> color{{1, 1, 1}};
+    UpAxis up = UpAxis::kY;
+    /// Of the sun, in degrees: from the front towards +x, and above the horizon.
+    double azimuth = -29;
+    double elevation = 41;
 };
 
 /// A level of a sidecar, lit. Control values are interpolated between the centres of super-voxels
@@ -32,14 +50,19 @@ struct Picture {
 /// absorption.
 class LitPreview {
   public:
-    /// Reads the level's grid and computes the light that arrives inside, in parallel. `level`: 0
-    /// for the baked control. Throws Error.
-    LitPreview(const std::string& sidecarPath, uint32_t level, float scale,
-               const std::array<float, 3>& color);
+    /// Reads the level's grid and computes the light that arrives inside, in parallel. Throws
+    /// Error.
+    LitPreview(const std::string& sidecarPath, const LitOptions& options);
 
     /// Draws in parallel; `progress(fraction)` is called now and then, from any thread.
     Picture draw(const Camera& camera, int width, int height,
                  const std::function<void(double)>& progress) const;
+
+    /// World-space box of what is drawn.
+    WorldBox box() const;
+
+    /// Which pixels of a picture meet anything.
+    std::vector<char> hits(const Camera& camera, int width, int height) const;
 
     size_t bytes() const {
         return volume_.bytes() + table_.bytes() + regions_.capacity() * sizeof(Region) +
@@ -48,6 +71,12 @@ class LitPreview {
 
   private:
     using Light = std::array<float, 3>;
+
+    /// Light from one direction.
+    struct Source {
+        trk::Vec3d towards;  ///< world space
+        std::array<double, 3> radiance;
+    };
 
     /// A brick of the field, or a constant region: light is tabulated at (cells + 1)^3 places.
     struct Region {
@@ -58,11 +87,14 @@ class LitPreview {
         size_t first;                   // place, in light_; x slowest
     };
 
+    static std::vector<Source> makeSources(const LitOptions& options);
     Light computeLight(const trk::Vec3d& local) const;
     Light lightAt(const trk::Vec3d& local) const;
     void tabulateLight();
-    void drawPixel(const TrkRay& ray, Picture& picture, size_t pixel) const;
+    void drawPixel(const TrkRay& ray, double farDepth, Picture& picture, size_t pixel) const;
+    double farSide(const Camera& camera) const;
 
+    std::vector<Source> sources_;
     trk::Volume volume_;      // the interpolated control, as if it were a density
     trk::SparseTable table_;  // to regions_
     std::vector<Region> regions_;

@@ -72,10 +72,10 @@ double previewScale(const ExtinctionField& field, const trk::AffineMap& indexToW
     }
     const auto middle = depths.begin() + static_cast<std::ptrdiff_t>(depths.size() / 2);
     std::nth_element(depths.begin(), middle, depths.end());
-    constexpr double kShown = 3.2;  // -log(0.04)
+    constexpr double kShown = 4.6;  // -log(0.01)
     // From a veil to a solid body, the volume's own scale is what its maker meant.
-    constexpr double kThinnest = 1.2;
-    constexpr double kThickest = 9;
+    constexpr double kThinnest = 3;
+    constexpr double kThickest = 12;
     if (*middle >= kThinnest && *middle <= kThickest) {
         return 1;
     }

@@ -8,7 +8,7 @@
 namespace vdbtools {
 
 /// The scale (extinction over density) at which half of the axis-parallel lines through places of
-/// the volume let more than 4 % of the light through, with two digits; 1 where that shows the
+/// the volume let more than 1 % of the light through, with two digits; 1 where that shows the
 /// volume well, or it is empty. Neither super-voxels nor views matter.
 double previewScale(const trk::ExtinctionField& field, const trk::AffineMap& indexToWorld);
 

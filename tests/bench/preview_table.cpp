@@ -106,7 +106,10 @@ void printRow(const std::string& vdb, int size, ControlKind kind, uint32_t level
         scale = -std::log(0.3) / hits[hits.size() / 2];
         const std::vector<double> plain = depths(control, camera, TRK_METHOD_CONTROL, level);
         errors[0] = rmse(depth, scale, [&](size_t i) { return std::exp(-scale * plain[i]); });
-        const vdbtools::LitPreview lit(sidecar, level, static_cast<float>(scale), {{1, 1, 1}});
+        vdbtools::LitOptions options;
+        options.level = level;
+        options.scale = static_cast<float>(scale);
+        const vdbtools::LitPreview lit(sidecar, options);
         const vdbtools::Picture picture = lit.draw(camera, kEdge, kEdge, [](double) {});
         errors[1] = rmse(depth, scale, [&](size_t i) {
             return static_cast<double>(picture.transmittance[0][i]);
@@ -126,7 +129,10 @@ void printRow(const std::string& vdb, int size, ControlKind kind, uint32_t level
         const auto start = std::chrono::steady_clock::now();
         const track::Volume control = track::Volume::open("", sidecar.c_str());
         const vdbtools::Camera camera = cameraFor(control);
-        const vdbtools::LitPreview lit(sidecar, level, static_cast<float>(scale), {{1, 1, 1}});
+        vdbtools::LitOptions options;
+        options.level = level;
+        options.scale = static_cast<float>(scale);
+        const vdbtools::LitPreview lit(sidecar, options);
         const vdbtools::Picture picture = lit.draw(camera, kEdge, kEdge, [](double) {});
         const std::chrono::duration<double> elapsed = std::chrono::steady_clock::now() - start;
         std::printf(" %.2f s | %.2f MB |", elapsed.count(), static_cast<double>(lit.bytes()) / 1e6);

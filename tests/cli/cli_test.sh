@@ -101,6 +101,13 @@ case_usage() {
     usage "--resolution 0x5" preview x --resolution 0x5
     usage "--resolution 70000x5" preview x --resolution 70000x5
     usage "--resolution 5" preview x --resolution 5
+    usage "--up x" preview x --up x
+    usage "--light 1" preview x --light 1
+    usage "--light 0,95" preview x --light 0,95
+    usage "--half: of no use for a PNG" preview x --half
+    usage "--first: of no use without --frames" preview x --first 7
+    usage "--no-sky: of no use with --transmittance" preview x --transmittance --no-sky
+    usage "--scale and --scale-from" preview x --scale 2 --scale-from y
     usage "--view back" preview x --view back
     usage "--frames 0" preview x --frames 0
     usage "--color 1,2" preview x --color 1,2
@@ -125,15 +132,35 @@ case_main_job() {
     expect 0 info cloud.track.vdb
     contains stdout "16^3 voxels"
     expect 0 preview cloud.track.vdb -o cloud.png --resolution 64x48
-    contains stderr "median transmittance 0.05"
+    contains stderr "(of the sidecar), means of"
     [ "$(head -c 4 cloud.png | tail -c 3)" = PNG ] || fail "cloud.png is no PNG"
-    expect 0 preview cloud.track.vdb -o cloud.exr --level 1 --view top --scale 2
+    expect 0 preview cloud.track.vdb -o cloud.exr --level 0 --view top --scale 2
     [ "$(od -An -tx1 -N4 cloud.exr | tr -d ' ')" = 762f3101 ] || fail "cloud.exr is no EXR"
-    for attribute in track:scale track:eye track:source transmittance.G halfDepth.Z; do
+    for attribute in track:scale track:eye track:source transmittance.G halfDepth.Z sky.B worldToCamera worldToNDC; do
         grep -qa "$attribute" cloud.exr || fail "cloud.exr lacks $attribute"
     done
     expect 0 preview cloud.track.vdb
     exists cloud.track.png
+    # A finer picture than its super-voxels of 16 allow: the sidecar has means for it.
+    expect 0 preview cloud.track.vdb -o level.png --level 0
+    contains stderr "level 0"
+    cmp -s level.png cloud.track.png && fail "the finest means are not drawn"
+    expect 0 preview cloud.track.vdb -o half.exr --half --no-sky --resolution 32x32
+    grep -qa sky.B half.exr && fail "--no-sky draws a sky"
+    expect 0 preview cloud.track.vdb -o alpha.png --no-sky --resolution 32x32
+    [ "$(od -An -tu1 -j25 -N1 alpha.png | tr -d ' ')" = 6 ] || fail "a PNG without sky has no alpha"
+    for options in "--up z" "--light 90,10" "--light 90,80"; do
+        # shellcheck disable=SC2086
+        expect 0 preview cloud.track.vdb -o other.png --resolution 64x48 --force $options
+        cmp -s other.png cloud.png && fail "$options changes nothing"
+    done
+    # One scale for a sequence.
+    "$vdbtrack" make other.vdb --kind smoke --voxels 32 --quiet
+    expect 0 bake other.vdb
+    contains stderr "grid density"
+    contains stderr "preview scale"
+    expect 0 preview other.track.vdb --scale-from cloud.track.vdb
+    contains stderr "(of cloud.track.vdb)"
     some_rays
     expect 0 query cloud.vdb --rays rays.csv
     [ "$(wc -l <stdout)" = 5 ] || fail "expected a header and 4 rows"
@@ -207,14 +234,16 @@ case_turntable() {
         some_rays
         # shellcheck disable=SC2086
         expect 2 $command --level 5
-        contains stderr "--level 5: expected 0 to 4, the levels of cloud.track.vdb"
+        contains stderr "--level 5: expected 0 to 1, the levels of cloud.track.vdb"
     done
     absent x.png
     mkdir 'd#1'
     expect 0 preview cloud.track.vdb -o 'd#1/f.png' --frames 2 --resolution 8x8
     exists 'd#1/f.0002.png'
     expect 0 preview cloud.track.vdb -o away.png --resolution 8x8 --camera 20,20,20,40,40,40,30
-    contains stderr "scale 1 (nothing found to choose it by)"
+    expect 0 preview cloud.track.vdb -o 'shot.####.png' --frames 2 --first 1001 --resolution 8x8
+    exists shot.1001.png
+    exists shot.1002.png
     expect 1 preview cloud.track.vdb -o huge.png --resolution 65536x65536
     one_line "huge.png: 65536x65536 pixels need"
     absent huge.png
@@ -283,11 +312,11 @@ case_query_output() {
     awk -F, 'NR == 2 && !($3 > 0 && $3 <= 0.2 && $6 > 0) { exit 1 }' stdout || fail "--error: $(cat stdout)"
     expect 0 query cloud.vdb --rays rays.csv --method residual --error 1e-5
     awk -F, 'NR == 2 && !($3 == 0 && $6 == 0 && $4 > 0) { exit 1 }' stdout || fail "exact: $(cat stdout)"
-    expect 0 query cloud.vdb --rays rays.csv --method control --level 2
+    expect 0 query cloud.vdb --rays rays.csv --method control --level 1
     # The sidecar alone knows its control.
     cp stdout level2.csv
     mv cloud.vdb away.vdb
-    expect 0 query cloud.track.vdb --rays rays.csv --method control --level 2
+    expect 0 query cloud.track.vdb --rays rays.csv --method control --level 1
     cmp -s stdout level2.csv || fail "the sidecar alone answers otherwise"
     expect 1 query cloud.track.vdb --rays rays.csv
     one_line "is a sidecar; expected the density"
@@ -419,7 +448,7 @@ case_bad_files() {
     expect 1 preview cut.track.vdb
     one_line "cut.track.vdb"
     expect 1 preview cloud.vdb
-    one_line "expected a sidecar"
+    one_line "cloud.vdb: is no sidecar; expected cloud.track.vdb, which is beside it"
     expect 1 bake cloud.vdb --grid heat -o heat.track.vdb
     one_line 'no grid "heat"; the file has density'
     absent heat.track.vdb
@@ -687,7 +716,7 @@ case_vdb_print() {
     done
     expect 0 bake cloud.vdb --size 8 --control affine --force
     vdb_print -l cloud.track.vdb >printed 2>&1 || fail "vdb_print: $(cat printed)"
-    contains printed density_control_gradient
+    contains printed density_gradient
     contains printed density_deviation
 }
 

@@ -45,19 +45,21 @@ else
     run make "$vdb" --force
 fi
 sidecar=$out/$name.track.vdb
-run bake "$vdb" -o "$sidecar" --size 4 --force
+run bake "$vdb" -o "$sidecar" --force
 run verify "$vdb" "$sidecar"
-run info "$sidecar"
-scale=$(run preview "$sidecar" -o "$out/$name.png" --force 2>&1 | tee /dev/stderr |
-        sed -n 's/.*, scale \([^ ,]*\).*/\1/p')
-run preview "$sidecar" -o "$out/$name.exr" --scale "$scale" --force
+run info "$sidecar" --values
+run preview "$sidecar" -o "$out/$name.png" --force
+run preview "$sidecar" -o "$out/$name.exr" --force
 
-# A few rays from the first corner of the volume's box to points of the opposite faces.
-"$vdbtrack" info "$sidecar" --json | tr -d ' ,' | awk '
+# A few rays from the first corner of the volume's box to points of the opposite faces, at the scale of
+# the pictures.
+"$vdbtrack" info "$sidecar" --values --json >"$out/$name.json"
+scale=$(sed -n 's/.*"preview_scale": \([^,]*\).*/\1/p' "$out/$name.json")
+tr -d ' ,' <"$out/$name.json" | awk '
     /bounds_min|bounds_max/ { at = $0; n = 0; next }
     at != "" && n < 3 { v[at ~ /min/, n++] = $0 }
     END {
-        print "# ox,oy,oz,dx,dy,dz"
+        print "ox,oy,oz,dx,dy,dz"
         for (i = 1; i <= 5; ++i) {
             f = i / 6
             printf "%.9g,%.9g,%.9g,%.9g,%.9g,%.9g\n", v[1, 0], v[1, 1], v[1, 2],
@@ -65,16 +67,24 @@ run preview "$sidecar" -o "$out/$name.exr" --scale "$scale" --force
         }
     }' >"$out/rays.csv"
 for method in exact residual; do
-    run query "$vdb" --sidecar "$sidecar" --rays "$out/rays.csv" --method $method --scale "$scale"
+    echo
+    echo "\$ vdbtrack query $vdb --sidecar $sidecar --rays $out/rays.csv --method $method --scale $scale"
+    "$vdbtrack" query "$vdb" --sidecar "$sidecar" --rays "$out/rays.csv" --method $method --scale "$scale" \
+        -o "$out/$method.csv" --force
+    cat "$out/$method.csv"
 done
+echo
+echo "How far the estimates lie from the exact values, in their standard errors (|z| above 3 is rare):"
+paste -d, "$out/exact.csv" "$out/residual.csv" | awk -F, 'NR > 1 {
+    printf "  ray %s: z = %s\n", $1, $8 > 0 ? sprintf("%+.2f", ($7 - $2) / $8) : "- (both exact)" }'
 
 cat <<TEXT
 
 Done. In $out:
-  $name.png  the baked control in sun and sky
+  $name.png  the means that the sidecar holds, in sun and sky
   $name.exr  the same in float, with layers for transmittance and the depth at which half is left
   $name.track.vdb  the sidecar: an ordinary VDB with control and residual bounds
-  rays.csv  the rays of the two tables above
+  rays.csv, exact.csv, residual.csv  the rays of the two tables above, and their answers
 
 Next: look at $out/$name.png, then try
   $vdbtrack --help

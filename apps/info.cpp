@@ -5,14 +5,21 @@
 #include "bake.h"
 #include "failure.h"
 #include "io/density.h"
+#include "io/density_types.h"
 #include "io/sidecar.h"
+#include "io/sidecar_schema.h"
 #include "io/vdb_file.h"
 
 #include <nlohmann/json.hpp>
 
+#include <algorithm>
 #include <cmath>
 #include <cstdio>
+#include <cstring>
 #include <iostream>
+#include <iterator>
+#include <sstream>
+#include <vector>
 
 namespace apps {
 namespace {
@@ -29,11 +36,52 @@ void addBounds(Json& json, const trk::AffineMap& map, const trk::Int3& anchor,
     json["bounds_max"] = hi;
 }
 
-/// One grid: what its metadata says and, for a grid that can be baked, what its voxels say.
-Json describeGrid(trk::VdbFile& file, const trk::VdbEntry& entry) {
+/// Source index to world space: three rows of the linear part, then the translation.
+std::vector<double> mapOf(const trk::AffineMap& map) {
+    std::vector<double> numbers;
+    for (const auto& row : map.linear) {
+        numbers.insert(numbers.end(), std::begin(row), std::end(row));
+    }
+    numbers.insert(numbers.end(), std::begin(map.translation), std::end(map.translation));
+    return numbers;
+}
+
+/// What the voxels of a grid that can be baked say.
+void addValues(const std::string& path, const trk::VdbEntry& entry, Json& json) {
+    trk::DensityOptions options;
+    options.gridNamed = true;
+    options.gridName = entry.name + "[" + std::to_string(entry.index) + "]";
+    try {
+        const trk::Density density = trk::loadDensity(path, options);
+        json["active_voxels"] = density.summary.activeVoxels;
+        json["min"] = density.summary.min;
+        json["max"] = density.summary.max;
+        addBounds(json, density.summary.indexToWorld, density.summary.anchor, density.field.box());
+        json["openvdb_bytes"] = density.summary.gridBytes;
+        json["brick_bytes"] = density.field.bytes();
+        json["bricks"] = density.field.brickCount();
+        json["brick_storage"] = density.field.isHalf() ? "half" : "float";
+    } catch (const trk::Error& e) {
+        if (e.status() == TRK_ERROR_BAD_FILE) {  // not a kind of grid, but a damaged file
+            throw;
+        }
+        const std::string where = path + ": grid " + entry.label() + ": ";
+        std::string reason = e.what();
+        if (reason.compare(0, where.size(), where) == 0) {
+            reason.erase(0, where.size());
+        }
+        json["can_be_baked"] = false;
+        json["reason"] = reason;
+    }
+}
+
+/// One grid: what its header says, and with `values` what its voxels say.
+Json describeGrid(trk::VdbFile& file, const trk::VdbEntry& entry, bool values) {
     Json json;
-    json["grid"] = entry.label();
+    json["grid"] = entry.rawLabel();
     json["type"] = entry.type;
+    json["stored_as_half"] = entry.half;
+    json["compression"] = entry.compressionName();
     const openvdb::GridBase::Ptr grid = file.readMetadata(entry);
     if (!grid) {
         json["can_be_baked"] = false;
@@ -43,66 +91,79 @@ Json describeGrid(trk::VdbFile& file, const trk::VdbEntry& entry) {
     json["class"] = openvdb::GridBase::gridClassToString(grid->getGridClass());
     const openvdb::Vec3d size = grid->voxelSize();
     json["voxel_size"] = {size.x(), size.y(), size.z()};
-    json["stored_as_half"] = entry.half;
-    trk::DensityOptions options;
-    options.gridNamed = true;
-    options.gridName = entry.name + "[" + std::to_string(entry.index) + "]";
+    // Metadata may lie: these are what the file claims.
+    const auto lo = grid->getMetadata<openvdb::Vec3IMetadata>("file_bbox_min");
+    const auto hi = grid->getMetadata<openvdb::Vec3IMetadata>("file_bbox_max");
+    const auto count = grid->getMetadata<openvdb::Int64Metadata>("file_voxel_count");
+    if (lo && hi) {
+        json["claimed_index_box"] = {lo->value().x(), lo->value().y(), lo->value().z(),
+                                     hi->value().x(), hi->value().y(), hi->value().z()};
+    }
+    if (count) {
+        json["claimed_active_voxels"] = count->value();
+    }
+    const std::string where = file.path() + ": grid " + entry.label();
+    json["can_be_baked"] = true;
     try {
-        const trk::Density density = trk::loadDensity(file.path(), options);
-        json["active_voxels"] = density.summary.activeVoxels;
-        json["min"] = density.summary.min;
-        json["max"] = density.summary.max;
-        addBounds(json, density.summary.indexToWorld, density.summary.anchor, density.field.box());
-        json["openvdb_bytes"] = density.summary.gridBytes;
-        json["brick_bytes"] = density.field.bytes();
-        json["bricks"] = density.field.brickCount();
-        json["brick_storage"] = density.field.isHalf() ? "half" : "float";
-        json["can_be_baked"] = true;
+        json["index_to_world"] = mapOf(trk::affineMap(grid->constTransform(), where));
+        trk::checkKind(entry.type, grid.get(), where);
     } catch (const trk::Error& e) {
-        if (e.status() == TRK_ERROR_BAD_FILE) {  // not a kind of grid, but a damaged file
-            throw;
-        }
-        const std::string where = file.path() + ": grid " + entry.label() + ": ";
-        std::string reason = e.what();
-        if (reason.compare(0, where.size(), where) == 0) {
-            reason.erase(0, where.size());
-        }
         json["can_be_baked"] = false;
-        json["reason"] = reason;
+        json["reason"] = std::string(e.what()).substr(where.size() + 2);
+        return json;
+    }
+    if (values) {
+        addValues(file.path(), entry, json);
     }
     return json;
 }
 
-Json describeSidecar(const std::string& path) {
-    const trk::Sidecar sidecar = trk::readSidecar(path, nullptr, TRK_CHECK_FULL);
+Json describeSidecar(const std::string& path, bool values) {
+    trk::Sidecar sidecar;
+    if (values) {
+        sidecar = trk::readSidecar(path, nullptr, TRK_CHECK_FULL);
+    } else {
+        sidecar.header = trk::readSidecarHeader(path);
+    }
     const trk::SidecarHeader& header = sidecar.header;
     Json json;
     json["file"] = path;
     json["kind"] = "sidecar";
+    json["format"] = header.format;
+    json["tool_version"] = header.toolVersion;
     json["source_file"] = header.sourceFile;
     json["source_grid"] = header.source.name;
     json["source_index"] = header.source.index;
-    json["tool_version"] = header.toolVersion;
-    json["channels"] = sidecar.baked.channels;
+    json["source_digest"] = trk::schema::hexDigest(header.digest);
+    json["source_bytes"] = header.sourceBytes;
+    json["source_modified_ns"] = header.sourceModified;
+    json["value_type"] = header.valueType;
     json["control"] = trk::controlName(header.controlKind);
-    const vdbtools::ControlFit fit = vdbtools::measureFit(sidecar.baked);
-    json["residual_rms"] = fit.residualRms;
-    json["constant_residual_rms"] = fit.constantRms;
-    json["field_rms"] = fit.fieldRms;
-    json["control_mass_ratio"] = fit.massRatio;
     json["super_voxel_size"] = header.superVoxelSize;
-    json["super_voxels"] = sidecar.baked.table.occupiedItems();
     json["levels"] = header.levels;
+    json["preview_size"] = header.previewSize;
+    json["preview_scale"] = header.previewScale;
     json["voxel_size"] = {length(header.indexToWorld.column(0)),
                           length(header.indexToWorld.column(1)),
                           length(header.indexToWorld.column(2))};
-    addBounds(json, header.indexToWorld, sidecar.anchor, sidecar.baked.table.occupiedBox());
-    json["max_density"] = sidecar.baked.maxDensity();
+    json["index_to_world"] = mapOf(header.indexToWorld);
+    json["origin"] = header.origin;
     if (header.repair & TRK_REPAIR_DROP_NONFINITE) {
         json["dropped_nonfinite"] = header.dropped;
     }
     if (header.repair & TRK_REPAIR_CLAMP_NEGATIVE) {
         json["clamped_negative"] = header.clamped;
+    }
+    if (values) {
+        const vdbtools::ControlFit fit = vdbtools::measureFit(sidecar.baked);
+        json["channels"] = sidecar.baked.channels;
+        json["super_voxels"] = sidecar.baked.table.occupiedItems();
+        json["residual_rms"] = fit.residualRms;
+        json["constant_residual_rms"] = fit.constantRms;
+        json["field_rms"] = fit.fieldRms;
+        json["control_mass_ratio"] = fit.massRatio;
+        json["max_density"] = sidecar.baked.maxDensity();
+        addBounds(json, header.indexToWorld, sidecar.anchor, sidecar.baked.table.occupiedBox());
     }
     return json;
 }
@@ -164,66 +225,136 @@ std::string formatSize(const Json& size) {
     return text;
 }
 
+/// Control characters would break the lines of a listing.
+std::string printable(std::string text) {
+    for (char& c : text) {
+        c = static_cast<unsigned char>(c) < ' ' || c == 0x7f ? '?' : c;
+    }
+    return text;
+}
+
+/// The map's translation, and that it does more than scale, where it does.
+std::string formatMap(const Json& map) {
+    char text[96];
+    std::snprintf(text, sizeof(text), "origin at (%.6g, %.6g, %.6g)", map[9].get<double>(),
+                  map[10].get<double>(), map[11].get<double>());
+    bool straight = true;
+    for (size_t i = 0; i < 9; ++i) {
+        straight = straight && (i % 4 == 0 || map[i].get<double>() == 0);
+    }
+    return text + std::string(straight ? "" : ", rotated or sheared");
+}
+
+void printRow(const char* name, const std::string& value) {
+    std::cout << "  " << name << std::string(14 - std::min<size_t>(std::strlen(name), 13), ' ')
+              << value << "\n";
+}
+
 void printGrid(const Json& grid) {
-    std::cout << "\n"
-              << grid["grid"].get<std::string>() << "\n  type        "
-              << grid["type"].get<std::string>()
-              << (grid.value("stored_as_half", false) ? ", half in the file" : "") << "\n";
+    std::cout << "\n" << printable(grid["grid"].get<std::string>()) << "\n";
+    printRow("type", printable(grid["type"].get<std::string>()) +
+                         (grid["stored_as_half"].get<bool>() ? ", half in the file" : ""));
+    printRow("compression", grid["compression"].get<std::string>());
     if (grid.contains("class")) {
-        std::cout << "  class       " << grid["class"].get<std::string>() << "\n  voxel size  "
-                  << formatSize(grid["voxel_size"]) << "\n";
+        printRow("class", grid["class"].get<std::string>());
+        printRow("voxel size", formatSize(grid["voxel_size"]));
     }
-    if (!grid["can_be_baked"].get<bool>()) {
-        std::cout << "  bake        no: " << grid["reason"].get<std::string>() << "\n";
-        return;
+    if (grid.contains("index_to_world")) {
+        printRow("transform", formatMap(grid["index_to_world"]));
     }
-    std::cout << "  voxels      " << grid["active_voxels"] << " active, values "
-              << grid["min"].get<float>() << " to " << grid["max"].get<float>()
-              << "\n  memory      " << byteCount(grid["brick_bytes"]) << " as "
-              << grid["brick_storage"].get<std::string>() << " bricks, "
-              << byteCount(grid["openvdb_bytes"]) << " in OpenVDB\n  bake        yes\n";
+    if (grid.contains("claimed_index_box")) {
+        const Json& b = grid["claimed_index_box"];
+        std::ostringstream box;
+        box << "(" << b[0] << ", " << b[1] << ", " << b[2] << ") to (" << b[3] << ", " << b[4]
+            << ", " << b[5] << ") in index space";
+        if (grid.contains("claimed_active_voxels")) {
+            box << ", " << grid["claimed_active_voxels"] << " active voxels";
+        }
+        printRow("claims", box.str());
+    }
+    if (grid.contains("active_voxels")) {
+        std::ostringstream voxels;
+        voxels << grid["active_voxels"] << " active, values " << grid["min"].get<float>() << " to "
+               << grid["max"].get<float>();
+        printRow("voxels", voxels.str());
+        printRow("bounds", formatBounds(grid));
+        printRow("memory", byteCount(grid["brick_bytes"]) + " as " +
+                               grid["brick_storage"].get<std::string>() + " bricks, " +
+                               byteCount(grid["openvdb_bytes"]) + " in OpenVDB");
+    }
+    printRow("bake", grid["can_be_baked"].get<bool>()
+                         ? grid.contains("active_voxels") ? "yes" : "yes, if its values are fit"
+                         : "no: " + printable(grid["reason"].get<std::string>()));
+}
+
+void printSidecar(const std::string& path, const Json& json) {
+    const auto text = [&](const char* key) { return json[key].dump(); };
+    std::cout << path << ": sidecar of grid \"" << printable(json["source_grid"].get<std::string>())
+              << "\" of " << printable(json["source_file"].get<std::string>()) << "\n";
+    printRow("format", json["format"].get<std::string>() + ", baked by vdbtrack " +
+                           json["tool_version"].get<std::string>());
+    printRow("source", "digest " + json["source_digest"].get<std::string>() + ", " +
+                           byteCount(json["source_bytes"]));
+    printRow("super-voxels", (json.contains("super_voxels") ? text("super_voxels") + " of " : "") +
+                                 text("super_voxel_size") + "^3 voxels, values " +
+                                 json["value_type"].get<std::string>());
+    printRow("control", json["control"].get<std::string>());
+    printRow("levels", text("levels"));
+    printRow("pictures",
+             (json["preview_size"] == 0 ? "by the control"
+                                        : "by means of " + text("preview_size") + "^3 voxels") +
+                 ", scale " + text("preview_scale"));
+    printRow("voxel size", formatSize(json["voxel_size"]));
+    printRow("transform", formatMap(json["index_to_world"]));
+    printRow("repaired", formatRepairs(json));
+    if (json.contains("super_voxels")) {
+        printRow("channels", text("channels"));
+        printRow("fit", formatFit(json));
+        printRow("bounds", formatBounds(json));
+        std::ostringstream density;
+        density << "up to " << json["max_density"].get<float>();
+        printRow("density", density.str());
+    }
 }
 
 void run(const Command& command, const std::vector<std::string>& given) {
     po::options_description options("Options");
-    options.add_options()("json", po::bool_switch(), "machine-readable");
+    options.add_options()("json", po::bool_switch(), "machine-readable")(
+        "values", po::bool_switch(),
+        "read the voxels too: how many, their range and bounds, memory, and how well a control "
+        "fits");
     const Arguments arguments(command, given, options, {"FILE.vdb"}, 1);
     const std::string path = arguments.text("FILE.vdb");
-    if (trk::isSidecar(path)) {
-        const Json json = describeSidecar(path);
-        if (arguments.flag("json")) {
-            std::cout << json.dump(2, ' ', false, Json::error_handler_t::replace) << "\n";
-            return;
-        }
-        std::cout << path << ": sidecar of grid \"" << json["source_grid"].get<std::string>()
-                  << "\" of " << json["source_file"].get<std::string>() << "\n"
-                  << "  super-voxels  " << json["super_voxels"] << " of "
-                  << json["super_voxel_size"] << "^3 voxels\n"
-                  << "  channels      " << json["channels"] << "\n"
-                  << "  control       " << json["control"].get<std::string>() << "\n"
-                  << "  fit           " << formatFit(json) << "\n"
-                  << "  levels        " << json["levels"] << "\n"
-                  << "  voxel size    " << formatSize(json["voxel_size"]) << "\n"
-                  << "  bounds        " << formatBounds(json) << "\n"
-                  << "  density       up to " << json["max_density"].get<float>() << "\n"
-                  << "  repaired      " << formatRepairs(json) << "\n"
-                  << "  baked by      vdbtrack " << json["tool_version"].get<std::string>() << "\n";
-        return;
-    }
-    trk::VdbFile file(path);
+    const bool values = arguments.flag("values");
     Json json;
-    json["file"] = path;
-    json["kind"] = "density";
-    json["grids"] = Json::array();
-    for (const trk::VdbEntry& entry : file.entries()) {
-        json["grids"].push_back(describeGrid(file, entry));
+    if (trk::isSidecar(path)) {
+        json = describeSidecar(path, values);
+    } else {
+        trk::VdbFile file(path);
+        json["file"] = path;
+        json["kind"] = "density";
+        json["version"] = file.header().version;
+        json["written_by_openvdb"] = file.header().writtenBy;
+        json["creator"] = file.header().creator;
+        json["grids"] = Json::array();
+        for (const trk::VdbEntry& entry : file.entries()) {
+            json["grids"].push_back(describeGrid(file, entry, values));
+        }
     }
     if (arguments.flag("json")) {
         std::cout << json.dump(2, ' ', false, Json::error_handler_t::replace) << "\n";
         return;
     }
-    std::cout << path << ": " << file.entries().size()
-              << (file.entries().size() == 1 ? " grid\n" : " grids\n");
+    if (json["kind"] == "sidecar") {
+        printSidecar(path, json);
+        return;
+    }
+    const std::string creator = json["creator"];
+    std::cout << path << ": " << json["grids"].size()
+              << (json["grids"].size() == 1 ? " grid" : " grids") << ", VDB version "
+              << json["version"] << ", written by OpenVDB "
+              << json["written_by_openvdb"].get<std::string>()
+              << (creator.empty() ? "" : ", " + printable(creator)) << "\n";
     for (const Json& grid : json["grids"]) {
         printGrid(grid);
     }
@@ -231,7 +362,9 @@ void run(const Command& command, const std::vector<std::string>& given) {
 
 }  // namespace
 
-const Command kInfoCommand{"info", "vdbtrack info FILE.vdb [--json]",
-                           "Tells what a .vdb file or a sidecar holds.", run};
+const Command kInfoCommand{"info", "vdbtrack info FILE.vdb [--values] [--json]",
+                           "Tells what a .vdb file or a sidecar holds: by its headers, or with "
+                           "--values by its voxels too.",
+                           run};
 
 }  // namespace apps

@@ -128,9 +128,17 @@ case_main_job() {
     expect 0 verify cloud.vdb
     contains stderr "all bounds hold"
     expect 0 info cloud.vdb
-    contains stdout "bake        yes"
+    contains stdout "VDB version 224, written by OpenVDB"
+    contains stdout "bake          yes, if its values are fit"
+    contains stdout "compression   "
+    contains stdout "index space, "
+    expect 0 info cloud.vdb --values
+    contains stdout "bake          yes"
+    contains stdout "bounds"
     expect 0 info cloud.track.vdb
     contains stdout "16^3 voxels"
+    contains stdout "format        2.0"
+    contains stdout "digest "
     expect 0 preview cloud.track.vdb -o cloud.png --resolution 64x48
     contains stderr "(of the sidecar), means of"
     [ "$(head -c 4 cloud.png | tail -c 3)" = PNG ] || fail "cloud.png is no PNG"
@@ -174,7 +182,7 @@ case_colour() {
         expect 0 bake color.vdb --size 8 --control $control --force
         expect 0 verify color.vdb
         contains stderr "all bounds hold"
-        expect 0 info color.track.vdb
+        expect 0 info color.track.vdb --values
         contains stdout "channels      3"
         contains stdout "control       $control"
         contains stdout "residual RMS"
@@ -577,8 +585,23 @@ case_json() {
     baked_cloud
     expect 0 info cloud.vdb --json
     contains stdout '"can_be_baked": true'
+    contains stdout '"claimed_active_voxels"'
+    grep -q brick_bytes stdout && fail "voxels are read unasked"
+    expect 0 info cloud.vdb --json --values
+    contains stdout '"active_voxels"'
+    contains stdout '"bounds_min"'
     expect 0 info cloud.track.vdb --json
     contains stdout '"super_voxel_size": 8'
+    contains stdout '"source_digest"'
+    expect 0 info cloud.track.vdb --json --values
+    contains stdout '"residual_rms"'
+    # A name with control characters: in a listing they are replaced, in JSON they survive.
+    printf 'de\tsit' >name
+    LC_ALL=C sed "s/density/$(cat name)y/" cloud.vdb >odd.vdb  # as long as before
+    expect 0 info odd.vdb --json
+    contains stdout '"de\tsity"'
+    expect 0 info odd.vdb
+    contains stdout 'de?sity'
 }
 
 case_real_volumes() {
@@ -618,6 +641,7 @@ case_real_volumes() {
     one_line 'density"[1]'
     for file in "$data"/*.vdb; do
         expect 0 info "$file"
+        expect 0 info "$file" --values
     done
 }
 

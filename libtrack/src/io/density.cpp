@@ -66,31 +66,6 @@ const VdbEntry& choose(VdbFile& file, const DensityOptions& options) {
                     "; choose one by name; the file has " + file.listing());
 }
 
-void checkKind(const VdbEntry& entry, const openvdb::GridBase* grid, const std::string& where) {
-    const auto refuse = [&](const std::string& found) {
-        throw Error(
-            TRK_ERROR_UNSUPPORTED_GRID,
-            where + ": is " + found + "; expected a fog volume of float, double, vec3s or vec3d");
-    };
-    const std::string valueType = valueTypeName(entry.type);
-    if (valueType == "half") {
-        refuse("of native halfs, which OpenVDB 13 writes (file version 225)");
-    }
-    if (!grid || channelCount(valueType) == 0) {
-        refuse("of type " + valueType);
-    }
-    switch (grid->getGridClass()) {
-        case openvdb::GRID_LEVEL_SET:
-            refuse("a level set");
-            break;
-        case openvdb::GRID_STAGGERED:
-            refuse("staggered");
-            break;
-        default:
-            break;
-    }
-}
-
 template <class Value>
 void checkValues(const TreeScan& scan, const Value& background, uint32_t repair,
                  const std::string& where) {
@@ -137,12 +112,38 @@ Density convert(const GridType& grid, const DensityOptions& options, const std::
 
 }  // namespace
 
+void checkKind(const std::string& treeType, const openvdb::GridBase* grid,
+               const std::string& where) {
+    const auto refuse = [&](const std::string& found) {
+        throw Error(
+            TRK_ERROR_UNSUPPORTED_GRID,
+            where + ": is " + found + "; expected a fog volume of float, double, vec3s or vec3d");
+    };
+    const std::string valueType = valueTypeName(treeType);
+    if (valueType == "half") {
+        refuse("of native halfs, which OpenVDB 13 writes (file version 225)");
+    }
+    if (!grid || channelCount(valueType) == 0) {
+        refuse("of type " + valueType);
+    }
+    switch (grid->getGridClass()) {
+        case openvdb::GRID_LEVEL_SET:
+            refuse("a level set");
+            break;
+        case openvdb::GRID_STAGGERED:
+            refuse("staggered");
+            break;
+        default:
+            break;
+    }
+}
+
 Density loadDensity(const std::string& path, const DensityOptions& options) {
     VdbFile file(path);
     const VdbEntry& entry = choose(file, options);
     const std::string where = path + ": grid " + entry.label();
     const openvdb::GridBase::Ptr metadata = file.readMetadata(entry);
-    checkKind(entry, metadata.get(), where);
+    checkKind(entry.type, metadata.get(), where);
     const AffineMap map = affineMap(metadata->constTransform(), where);
 
     openvdb::GridBase::Ptr grid = file.read(entry, options.maxMemory);

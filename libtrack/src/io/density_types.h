@@ -89,4 +89,9 @@ inline uint64_t valueBytes(const std::string& valueType) {
     return component * static_cast<uint64_t>(channelCount(valueType));
 }
 
+/// Throws UNSUPPORTED_GRID where a grid's type or class, as its header says, cannot be a density's;
+/// NULL for an unknown type. `where` begins the message.
+void checkKind(const std::string& treeType, const openvdb::GridBase* grid,
+               const std::string& where);
+
 }  // namespace trk

@@ -14,6 +14,7 @@ namespace trk {
 
 /// The metadata on every grid of a sidecar.
 struct SidecarHeader {
+    std::string format;  ///< "major.minor", of one that was read
     std::string toolVersion;
     std::string sourceFile;      ///< base name, informative
     uint64_t sourceBytes = 0;    ///< the source file's size, and when it was written,

@@ -96,6 +96,7 @@ SidecarHeader readHeader(VdbFile& file, const GridIdentity* source) {
     checkFormat(*grid, where);
     SidecarHeader header;
     header.prefix = control->name.substr(0, control->name.size() - std::strlen(kControlSuffix));
+    header.format = metaText(*grid, "track_format", where);
     header.toolVersion = metaText(*grid, "track_tool_version", where);
     header.sourceFile = metaText(*grid, "track_source_file", where);
     header.source.name = metaText(*grid, "track_source_grid", where);

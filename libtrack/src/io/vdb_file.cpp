@@ -95,13 +95,18 @@ class VdbFile::Archive : public openvdb::io::Archive {
         }
     }
 
-    void readHead(const std::string& path, std::vector<VdbEntry>& entries) {
-        checkMagic(path);
+    void readHead(const std::string& path, VdbFileHeader& header, std::vector<VdbEntry>& entries) {
+        header.version = checkMagic(path);
         stream_.exceptions(std::ios::badbit | std::ios::failbit | std::ios::eofbit);
         readHeader(stream_);
         tagStream(false);
         openvdb::MetaMap fileMetadata;
         fileMetadata.readMeta(stream_);
+        header.writtenBy =
+            std::to_string(libraryVersion().first) + "." + std::to_string(libraryVersion().second);
+        if (const auto creator = fileMetadata.getMetadata<openvdb::StringMetadata>("creator")) {
+            header.creator = creator->value();
+        }
         const int32_t count = readGridCount(stream_);
         if (count < 0) {
             badFile(path, "damaged: lists " + std::to_string(count) + " grids");
@@ -117,12 +122,17 @@ class VdbFile::Archive : public openvdb::io::Archive {
                     badFile(path, "damaged: grid " + entry.name + " ends before it begins");
                 }
                 entry.position = offsets[0];
+                stream_.seekg(offsets[0]);
+                tagStream(entry.half);
+                readGridCompression(stream_);
+                entry.compression = openvdb::io::getDataCompression(stream_);
                 stream_.seekg(offsets[2]);
             } else {
                 int64_t offsets[3];
                 stream_.read(reinterpret_cast<char*>(offsets), sizeof(offsets));
                 entry.position = static_cast<int64_t>(stream_.tellg());
                 entry.loaded = readGrid(entry, true, 0, path);
+                entry.compression = openvdb::io::getDataCompression(stream_);
                 if (!entry.loaded) {
                     badFile(path, "grid " + entry.name + " of unknown type " + entry.type +
                                       " in a file without offsets, which cannot be skipped");
@@ -167,7 +177,8 @@ class VdbFile::Archive : public openvdb::io::Archive {
     }
 
   private:
-    void checkMagic(const std::string& path) {
+    /// The file's version, which this build reads.
+    uint32_t checkMagic(const std::string& path) {
         std::string head(20, '\0');
         stream_.read(head.data(), static_cast<std::streamsize>(head.size()));
         head.resize(static_cast<size_t>(stream_.gcount()));
@@ -201,6 +212,7 @@ class VdbFile::Archive : public openvdb::io::Archive {
         }
         stream_.clear();
         stream_.seekg(0);
+        return version;
     }
 
     /// Attaches fresh stream metadata, which OpenVDB's reading steps consult and change per grid.
@@ -264,12 +276,23 @@ class VdbFile::Archive : public openvdb::io::Archive {
     openvdb::io::StreamMetadata::Ptr metadata_;
 };
 
+std::string VdbEntry::rawLabel() const {
+    return name.empty() || equalNames > 1 ? name + "[" + std::to_string(index) + "]" : name;
+}
+
 std::string VdbEntry::label() const {
-    std::string text = name;
+    std::string text = rawLabel();
     for (char& c : text) {  // damaged files have names that would break the one line of an error
         c = static_cast<unsigned char>(c) < ' ' || c == 0x7f ? '?' : c;
     }
-    return name.empty() || equalNames > 1 ? text + "[" + std::to_string(index) + "]" : text;
+    return text;
+}
+
+std::string VdbEntry::compressionName() const {
+    const std::string codec = compression & openvdb::io::COMPRESS_BLOSC ? "blosc"
+                              : compression & openvdb::io::COMPRESS_ZIP ? "zip"
+                                                                        : "none";
+    return compression & openvdb::io::COMPRESS_ACTIVE_MASK ? codec + ", active values only" : codec;
 }
 
 VdbFile::VdbFile(const std::string& path) : path_(path) {
@@ -280,7 +303,7 @@ VdbFile::VdbFile(const std::string& path) : path_(path) {
         bytes_ = static_cast<uint64_t>(info.st_size);
         modified_ = int64_t{info.st_mtim.tv_sec} * 1000000000 + info.st_mtim.tv_nsec;
     }
-    reading(path, [&] { archive_->readHead(path, entries_); });
+    reading(path, [&] { archive_->readHead(path, header_, entries_); });
     std::map<std::string, int> counts;
     for (VdbEntry& entry : entries_) {
         entry.index = counts[entry.name]++;

@@ -20,13 +20,25 @@ struct VdbEntry {
     int equalNames = 1;  ///< how many grids have that name
     std::string type;    ///< OpenVDB's, e.g. "Tree_float_5_4_3"
     std::string uniqueName;
-    std::string parent;  ///< unique name of the grid whose tree this one shares; else empty
-    bool half = false;   ///< values are halfs in the file
+    std::string parent;        ///< unique name of the grid whose tree this one shares; else empty
+    bool half = false;         ///< values are halfs in the file
+    uint32_t compression = 0;  ///< of its voxels, OpenVDB's COMPRESS_… bits
     int64_t position = 0;
     openvdb::GridBase::Ptr loaded;  ///< in files without offsets, which are read at once
 
-    /// "density", or "density[1]" where the name alone is ambiguous or empty.
+    /// "density", or "density[1]" where the name alone is ambiguous or empty; fit for one line.
     std::string label() const;
+    /// The same as it is, whatever damaged files name their grids.
+    std::string rawLabel() const;
+    /// "blosc, active values only", say.
+    std::string compressionName() const;
+};
+
+/// What a file says of itself.
+struct VdbFileHeader {
+    uint32_t version = 0;   ///< of the format, 224 say
+    std::string writtenBy;  ///< the OpenVDB, "10.0"
+    std::string creator;    ///< the program, where it says so
 };
 
 /// An open .vdb file. Not thread-safe.
@@ -40,6 +52,7 @@ class VdbFile {
     uint64_t bytes() const { return bytes_; }
     /// When it was written, in nanoseconds since 1970.
     int64_t modified() const { return modified_; }
+    const VdbFileHeader& header() const { return header_; }
     const std::vector<VdbEntry>& entries() const { return entries_; }
 
     /// A grid without its voxels: metadata and transform. NULL for a type that is not registered.
@@ -60,6 +73,7 @@ class VdbFile {
     std::string path_;
     uint64_t bytes_ = 0;
     int64_t modified_ = 0;
+    VdbFileHeader header_;
     std::vector<VdbEntry> entries_;
     std::unique_ptr<Archive> archive_;
 };

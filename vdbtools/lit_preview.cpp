@@ -365,8 +365,10 @@ void LitPreview::drawPixel(const TrkRay& ray, double farDepth, Picture& picture,
                     return true;
                 }
                 const auto count = stretchCount(t1 - t0, most);
-                const DepthInCell depthIn(
-                    [&](double s) { return densityAt(local.at(t0 + s * (t1 - t0))); });
+                // Of one stretch, nobody asks where in it.
+                const DepthInCell depthIn([&](double s) {
+                    return count > 1 ? densityAt(local.at(t0 + s * (t1 - t0))) : 0.0;
+                });
                 double from = 0;  // shares of the length, and of the depth
                 double depthFrom = 0;
                 for (int i = 1; i <= count; ++i) {

@@ -3,6 +3,7 @@
 #include "track/track.h"
 
 #include "failure.h"
+#include "parallel.h"
 #include "sampling.h"
 #include "transmittance.h"
 #include "volume.h"
@@ -274,7 +275,8 @@ TrkStatus trkOpenVolume(const char* vdbPath, const char* sidecarPath,
         }
         const trk::VolumeOptions opened = checked(given);
         const auto open = [&] {
-            *volume = new TrkVolume{trk::openVolume(vdbPath, sidecarPath, opened)};
+            trk::inGroupOfItsOwn(
+                [&] { *volume = new TrkVolume{trk::openVolume(vdbPath, sidecarPath, opened)}; });
         };
         if (given.threads == 0) {
             tbb::this_task_arena::isolate(open);

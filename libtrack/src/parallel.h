@@ -12,6 +12,15 @@
 
 namespace trk {
 
+/// Calls body(), whose own loops, OpenVDB's among them, then belong to a group that nobody cancels.
+/// Exceptions reach the caller.
+template <class Body>
+void inGroupOfItsOwn(const Body& body) {
+    tbb::task_group_context context(tbb::task_group_context::isolated);
+    tbb::parallel_for(
+        0, 1, [&](int) { body(); }, context);
+}
+
 /// Calls body(begin, end) for parts of [0, count) of about `grain`. Exceptions reach the caller.
 template <class Body>
 void parallelRanges(size_t count, size_t grain, const Body& body) {

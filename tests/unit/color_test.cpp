@@ -196,7 +196,8 @@ TEST(Colour, EveryKindOfSidecarReadsBackAndIsProved) {
                 EXPECT_GT(compared, 20u);
                 const auto report = vdbtools::verify(d.summary, read);
                 EXPECT_TRUE(report.holds) << report.counterexample;
-                for (size_t level = 0; level < 2; ++level) {
+                ASSERT_EQ(read.baked.levels.size(), expected.levels.size());
+                for (size_t level = 0; level < read.baked.levels.size(); ++level) {
                     EXPECT_EQ(read.baked.levels[level].values.size() % channels, 0u);
                     EXPECT_EQ(read.baked.levels[level].table.occupiedItems(),
                               expected.levels[level].table.occupiedItems());

@@ -5,6 +5,7 @@
 #include "bake.h"
 #include "io/density.h"
 #include "io/sidecar.h"
+#include "levels.h"
 
 #include <chrono>
 #include <cmath>
@@ -84,9 +85,12 @@ void run(const Command& command, const std::vector<std::string>& given) {
     const trk::DensitySummary& summary = density.summary;
     trk::BakedVolume baked;
     trk::SidecarHeader header;
+    // Controls that vary have more grids: no reason to have no picture.
+    const uint64_t limit = vdbtools::sidecarLimit(summary.fileBytes) +
+                           (bakeOptions.kind == trk::ControlKind::kConstant ? 0 : 40000);
     {
         const Progress progress(arguments, "baking " + input);
-        bakeOptions.sidecarBytes = vdbtools::sidecarLimit(summary.fileBytes);
+        bakeOptions.sidecarBytes = limit;
         baked = vdbtools::bake(density.field, bakeOptions);
         header = vdbtools::sidecarHeader(summary, density.field, baked);
     }
@@ -94,6 +98,11 @@ void run(const Command& command, const std::vector<std::string>& given) {
     {
         const Progress progress(arguments, "writing " + output);
         trk::writeSidecar(file, header, baked, summary.anchor);
+        // How well values compress was an estimate.
+        while (baked.previewSize > 0 && std::filesystem::file_size(file.path()) > limit) {
+            vdbtools::coarsenPreview(baked, density.field);
+            trk::writeSidecar(file, header, baked, summary.anchor);
+        }
         file.commit();
     }
     if (baked.items.empty() && !arguments.quiet()) {

@@ -13,6 +13,7 @@
 #include <filesystem>
 #include <iostream>
 #include <mutex>
+#include <new>
 #include <utility>
 
 namespace apps {
@@ -20,7 +21,8 @@ namespace po = boost::program_options;
 
 namespace {
 
-tbb::global_control* threadLimit = nullptr;
+// Room for one that is never destroyed.
+alignas(tbb::global_control) unsigned char threadLimit[sizeof(tbb::global_control)];
 
 std::mutex progressMutex;
 
@@ -67,7 +69,7 @@ Arguments::Arguments(const Command& command, const std::vector<std::string>& arg
     if (threads > 0) {
         // TBB obeys this for as long as it lives, and where it dies starts the threads it was kept
         // from starting: it never does.
-        threadLimit = new tbb::global_control(tbb::global_control::max_allowed_parallelism,
+        new (threadLimit) tbb::global_control(tbb::global_control::max_allowed_parallelism,
                                               static_cast<size_t>(threads));
     }
 }

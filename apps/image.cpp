@@ -87,6 +87,7 @@ void writeExr(const Image& image, bool half, const std::map<std::string, std::st
     try {
         Imf::Header header(image.width, image.height);
         Imf::FrameBuffer frame;
+        header.screenWindowWidth() = matrices.screenWindowWidth;
         Imf::addWorldToCamera(header, Imath::M44f(matrices.worldToCamera));
         Imf::addWorldToNDC(header, Imath::M44f(matrices.worldToNdc));
         std::map<std::string, std::vector<Imath::half>> halfs;

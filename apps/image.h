@@ -30,6 +30,7 @@ struct Image {
 struct CameraMatrices {
     float worldToCamera[4][4];
     float worldToNdc[4][4];
+    float screenWindowWidth;  ///< of the picture, one unit ahead
 };
 
 /// Writes every channel as 32-bit float, or, with `half`, all but depths (…Z) as 16-bit, with text

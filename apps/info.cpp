@@ -61,6 +61,7 @@ void addValues(const std::string& path, const trk::VdbEntry& entry, Json& json) 
         json["brick_bytes"] = density.field.bytes();
         json["bricks"] = density.field.brickCount();
         json["brick_storage"] = density.field.isHalf() ? "half" : "float";
+        json["can_be_baked"] = true;
     } catch (const trk::Error& e) {
         if (e.status() == TRK_ERROR_BAD_FILE) {  // not a kind of grid, but a damaged file
             throw;
@@ -103,7 +104,7 @@ Json describeGrid(trk::VdbFile& file, const trk::VdbEntry& entry, bool values) {
         json["claimed_active_voxels"] = count->value();
     }
     const std::string where = file.path() + ": grid " + entry.label();
-    json["can_be_baked"] = true;
+    json["can_be_baked"] = nullptr;  // unless its voxels are looked at
     try {
         json["index_to_world"] = mapOf(trk::affineMap(grid->constTransform(), where));
         trk::checkKind(entry.type, grid.get(), where);
@@ -267,6 +268,10 @@ void printGrid(const Json& grid) {
         std::ostringstream box;
         box << "(" << b[0] << ", " << b[1] << ", " << b[2] << ") to (" << b[3] << ", " << b[4]
             << ", " << b[5] << ") in index space";
+        if (b[0].get<int>() > b[3].get<int>()) {
+            box.str("no box");
+            box.seekp(0, std::ios::end);
+        }
         if (grid.contains("claimed_active_voxels")) {
             box << ", " << grid["claimed_active_voxels"] << " active voxels";
         }
@@ -282,8 +287,9 @@ void printGrid(const Json& grid) {
                                grid["brick_storage"].get<std::string>() + " bricks, " +
                                byteCount(grid["openvdb_bytes"]) + " in OpenVDB");
     }
-    printRow("bake", grid["can_be_baked"].get<bool>()
-                         ? grid.contains("active_voxels") ? "yes" : "yes, if its values are fit"
+    printRow("bake", grid["can_be_baked"].is_null() ? "yes, if its values are fit"
+                     : grid["can_be_baked"].get<bool>()
+                         ? "yes"
                          : "no: " + printable(grid["reason"].get<std::string>()));
 }
 

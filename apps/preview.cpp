@@ -108,22 +108,29 @@ Image transmittanceImage(const Shot& shot, const track::Volume& volume, const Ca
     return image;
 }
 
-/// From world space to the camera's, and to the picture's: -1 to 1 from left to right and from
-/// bottom to top, after division by w. For row vectors, as OpenEXR has them.
+/// From world space to the camera's, and to the picture's: -1 to 1 from left to right, from bottom
+/// to top and from near to far, after division by w. For row vectors, as OpenEXR has them.
 CameraMatrices matricesOf(const Shot& shot, const Camera& camera) {
     CameraMatrices matrices;
     const trk::AffineMap map = camera.worldToCamera();
-    const double zoom[3] = {1 / (camera.tangent * shot.aspect()), 1 / camera.tangent, 1};
+    const double width = camera.tangent * shot.aspect();
+    const double distance = length(shot.centre - camera.eye);
+    const double near = 0.01 * distance;
+    const double far = 100 * distance;
     for (size_t in = 0; in < 4; ++in) {
+        double c[4] = {0, 0, 0, in == 3 ? 1.0 : 0.0};
         for (size_t out = 0; out < 3; ++out) {
-            const double value = in < 3 ? map.linear[out][in] : map.translation[out];
-            matrices.worldToCamera[in][out] = static_cast<float>(value);
-            matrices.worldToNdc[in][out] = static_cast<float>(zoom[out] * value);
+            c[out] = in < 3 ? map.linear[out][in] : map.translation[out];
         }
-        const double z = in < 3 ? map.linear[2][in] : map.translation[2];
-        matrices.worldToCamera[in][3] = in == 3 ? 1.0f : 0.0f;
-        matrices.worldToNdc[in][3] = static_cast<float>(-z);  // what lies ahead has w > 0
+        const double ndc[4] = {c[0] / width, c[1] / camera.tangent,
+                               (-(far + near) * c[2] - 2 * far * near * c[3]) / (far - near),
+                               -c[2]};
+        for (size_t out = 0; out < 4; ++out) {
+            matrices.worldToCamera[in][out] = static_cast<float>(c[out]);
+            matrices.worldToNdc[in][out] = static_cast<float>(ndc[out]);
+        }
     }
+    matrices.screenWindowWidth = static_cast<float>(2 * width);
     return matrices;
 }
 
@@ -206,6 +213,13 @@ void run(const Command& command, const std::vector<std::string>& given) {
     std::string whose = "asked for";
     if (arguments.has("scale-from")) {
         shot.scale = static_cast<float>(headerOf(arguments.text("scale-from")).previewScale);
+        if (track::Volume::open("", arguments.text("scale-from").c_str()).info().superVoxelCount ==
+            0) {
+            throw trk::Error(
+                TRK_ERROR_INVALID_ARGUMENT,
+                arguments.text("scale-from") +
+                    ": is of an empty volume; expected one whose scale means something");
+        }
         whose = "of " + arguments.text("scale-from");
     } else if (!arguments.has("scale")) {
         shot.scale = static_cast<float>(header.previewScale);

@@ -85,6 +85,14 @@ struct Unknown {
     size_t dark = 0;
 };
 
+/// One line on stderr where --samples does not reach --error.
+void noteMissed(size_t rays, double wanted) {
+    if (rays > 0) {
+        std::cerr << "vdbtrack: note: " << rays << (rays == 1 ? " ray does" : " rays do")
+                  << " not reach --error " << static_cast<float>(wanted) << " within --samples\n";
+    }
+}
+
 /// One line on stderr on the errors that are empty, and what can be said instead.
 void noteUnknown(const Unknown& unknown, const TrkQuery& query) {
     if (unknown.rays == 0) {
@@ -121,6 +129,8 @@ std::string table(const Arguments& arguments, size_t channels, const TrkQuery& q
     out << "ray," << columns("transmittance", channels) << ',' << columns("stderr", channels) << ','
         << columns("optical_depth", channels) << ",lookups" << (bySamples ? ",samples\n" : "\n");
     Unknown unknown;
+    const double wanted = bySamples ? static_cast<double>(arguments.get<float>("error")) : 0;
+    size_t missed = 0;
     forEachChunk(arguments, rays.size(), [&](size_t begin, size_t count) {
         Answers answers(count, channels);
         answer(begin, count, answers);
@@ -131,6 +141,10 @@ std::string table(const Arguments& arguments, size_t channels, const TrkQuery& q
                 ++unknown.rays;
                 unknown.dark += *std::max_element(value, value + channels) == 0 ? 1 : 0;
             }
+            missed += bySamples && static_cast<double>(*std::max_element(error, error + channels)) >
+                                       wanted * (1 + 1e-6)
+                          ? 1
+                          : 0;
             out << begin + i;
             addColumns(out, value, channels);
             addColumns(out, error, channels);
@@ -144,6 +158,7 @@ std::string table(const Arguments& arguments, size_t channels, const TrkQuery& q
     });
     if (!arguments.quiet()) {
         noteUnknown(unknown, query);
+        noteMissed(missed, wanted);
     }
     return out.str();
 }
@@ -232,7 +247,8 @@ track::Query queryOf(const Arguments& arguments) {
     needs("samples", isRandom && !freePaths,
           freePaths ? "each ray of the file gets one path" : "only random methods take samples");
     needs("error", tracks && !freePaths,
-          "only residual, ratio and delta have a variance to choose by");
+          freePaths ? "paths have no variance to choose by"
+                    : "only residual, ratio and delta have a variance to choose by");
     needs("rate", tracks, "only residual, ratio, delta and free paths have one");
     needs("global", tracks, "only residual, ratio, delta and free paths walk over super-voxels");
     needs("choice", query.method == TRK_METHOD_RESIDUAL && !freePaths, "only residual has one");
@@ -298,6 +314,16 @@ struct Inputs {
     TrkVolumeOptions options;
 };
 
+/// What a bake was allowed to repair, so is a query that needs none; but it must not fail over a
+/// file that it does not need.
+uint32_t repairBeside(const std::string& sidecar) {
+    try {
+        return std::filesystem::exists(sidecar) ? trk::readSidecarHeader(sidecar).repair : 0u;
+    } catch (const trk::Error&) {
+        return 0;
+    }
+}
+
 /// The density with the sidecar that the method needs, or a sidecar alone.
 Inputs inputsOf(const Arguments& arguments, const TrkQuery& query,
                 const TrkVolumeOptions& options) {
@@ -318,15 +344,12 @@ Inputs inputsOf(const Arguments& arguments, const TrkQuery& query,
     } else if (!arguments.has("sidecar")) {
         inputs.sidecarPath = trk::defaultSidecarPath(inputs.density);
     }
-    const bool sidecarThere =
-        std::filesystem::exists(inputs.sidecarPath) && trk::isSidecar(inputs.sidecarPath);
-    // What needs no sidecar also must not fail over one that does not fit; but if the bake was
-    // allowed to repair values, so is this.
     const bool useSidecar = !densityAlone || arguments.has("sidecar");
-    if (!useSidecar && sidecarThere) {
-        inputs.options.repair |= trk::readSidecarHeader(inputs.sidecarPath).repair;
+    if (!useSidecar) {
+        inputs.options.repair |= repairBeside(inputs.sidecarPath);
     }
-    if (useSidecar && sidecarThere) {
+    if (useSidecar && std::filesystem::exists(inputs.sidecarPath) &&
+        trk::isSidecar(inputs.sidecarPath)) {
         const trk::SidecarHeader header = trk::readSidecarHeader(inputs.sidecarPath);
         checkLevel(inputs.sidecarPath, query.level, header);
         const TrkChoice choice = inputs.options.choice;
@@ -355,7 +378,7 @@ trk::Volume openInside(const Inputs& inputs) {
     options.global = inputs.options.global != 0;
     options.repair = inputs.options.repair;
     trk::Volume volume = trk::openVolume(inputs.density.c_str(), inputs.sidecar, options);
-    trk::requireSuperVoxels(volume);
+    trk::requireSuperVoxels(volume, ", or use TRK_METHOD_EXACT");
     return volume;
 }
 
@@ -425,9 +448,13 @@ void run(const Command& command, const std::vector<std::string>& given) {
     }
     const track::Query query = queryOf(arguments);
     const TrkVolumeOptions volumeOptions = volumeOptionsOf(arguments);
+    if (arguments.has("output") && arguments.text("output").empty()) {
+        throw UsageError("-o: expected a name, or -");
+    }
     const std::string output = arguments.text("output") == "-" ? "" : arguments.text("output");
     refuseInput(output,
-                {arguments.text("IN.vdb"), arguments.text("rays"), arguments.text("sidecar")});
+                {arguments.text("IN.vdb"), arguments.text("rays"), arguments.text("sidecar"),
+                 trk::defaultSidecarPath(arguments.text("IN.vdb"))});
     const std::vector<TrkRay> rays = readRays(arguments.text("rays"));
     if (rays.empty() && !arguments.quiet()) {
         std::cerr << "vdbtrack: note: " << arguments.text("rays") << ": no rays\n";

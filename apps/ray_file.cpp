@@ -9,6 +9,7 @@
 #include <charconv>
 #include <cmath>
 #include <cstring>
+#include <filesystem>
 #include <fstream>
 #include <iostream>
 #include <iterator>
@@ -62,7 +63,7 @@ using Order = std::array<size_t, 8>;
                      where + ": expected " + expected + ", found " + found);
 }
 
-std::string quoted(const std::string& line) {
+std::string inQuotes(const std::string& line) {
     return "\"" + line.substr(0, 60) + (line.size() > 60 ? "…\"" : "\"");
 }
 
@@ -80,7 +81,7 @@ Order parseHeader(const std::string& line, const std::string& where, size_t& cou
         const auto known = std::find(kColumns.begin(), kColumns.end(), name);
         if (known == kColumns.end()) {
             refuse(where, "numbers, or a header of the columns ox,oy,oz,dx,dy,dz[,tmin,tmax]",
-                   quoted(line));
+                   inQuotes(name) + " in " + inQuotes(line));
         }
         size_t& place = order[static_cast<size_t>(known - kColumns.begin())];
         if (place != kColumns.size()) {
@@ -100,6 +101,10 @@ Order parseHeader(const std::string& line, const std::string& where, size_t& cou
 std::string readAll(const std::string& path) {
     std::ifstream file;
     if (path != "-") {
+        std::error_code ignored;
+        if (std::filesystem::is_directory(path, ignored)) {
+            throw trk::Error(TRK_ERROR_IO, path + ": is a directory; expected a CSV file");
+        }
         file.open(path, std::ios::binary);
         if (!file) {
             throw trk::Error(TRK_ERROR_IO, path + ": cannot be opened: " + std::strerror(errno));
@@ -130,8 +135,8 @@ TrkRay toRay(const std::vector<double>& fields, const Order& order, const std::s
     if (!finite || zero) {
         throw trk::Error(TRK_ERROR_INVALID_ARGUMENT,
                          where +
-                             ": expected a finite origin, a finite direction that is not zero as a "
-                             "float, and limits that are not NaN");
+                             ": expected a finite origin, a finite direction that is not zero (as "
+                             "floats), and limits that are not NaN");
     }
     if (ray.tMin > ray.tMax) {
         std::ostringstream found;
@@ -175,7 +180,7 @@ std::vector<TrkRay> readRays(const std::string& path) {
             refuse(where,
                    columns > 0 ? std::to_string(columns) + " numbers, as the header names"
                                : "ox,oy,oz,dx,dy,dz[,tmin,tmax]",
-                   fields.empty() ? quoted(line) : std::to_string(fields.size()) + " numbers");
+                   fields.empty() ? inQuotes(line) : std::to_string(fields.size()) + " numbers");
         }
         rays.push_back(toRay(fields, order, where));
     }

@@ -177,7 +177,7 @@ void addLevels(trk::BakedVolume& baked, const trk::IntBox& box, int count) {
 void addPreview(trk::BakedVolume& baked, const ExtinctionField& field, uint64_t sidecarBytes) {
     constexpr int64_t kFinest =
         160;                       // cubes along the longest edge: about three pixels of 512 each
-    constexpr double kCube = 4.8;  // bytes a channel, of values and their nodes
+    constexpr double kCube = 3.9;  // bytes a channel, of values and their nodes
     const double room = static_cast<double>(sidecarBytes) - estimatedBytes(baked) - kGridBytes;
     const auto bytesOf = [&](double cubes) {
         return kCube * cubes * static_cast<double>(field.channels());
@@ -197,6 +197,19 @@ void addPreview(trk::BakedVolume& baked, const ExtinctionField& field, uint64_t 
             return;
         }
     }
+}
+
+void coarsenPreview(trk::BakedVolume& baked, const ExtinctionField& field) {
+    baked.previewSize *= 2;
+    if (baked.previewSize >= baked.superVoxelSize()) {
+        baked.previewSize = 0;
+        baked.preview = {};
+        return;
+    }
+    const ValueTable& finer = baked.preview;
+    baked.preview =
+        nextLevel(finer.table, field.box(), field.channels(),
+                  [&](size_t item, size_t c) { return finer.values[item * field.channels() + c]; });
 }
 
 }  // namespace vdbtools

@@ -19,4 +19,8 @@ void addLevels(trk::BakedVolume& baked, const trk::IntBox& box, int count);
 /// by estimate.
 void addPreview(trk::BakedVolume& baked, const trk::ExtinctionField& field, uint64_t sidecarBytes);
 
+/// Makes the cubes for pictures twice as large, or where they would be as large as super-voxels
+/// drops them.
+void coarsenPreview(trk::BakedVolume& baked, const trk::ExtinctionField& field);
+
 }  // namespace vdbtools

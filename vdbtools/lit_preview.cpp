@@ -37,6 +37,7 @@ constexpr double kSunRadius = 5;  // degrees
 // where the interpolated control is largest, and would show the grid of those places as dark dots.
 constexpr double kShadowStart = 1;
 constexpr int kShadowSteps = 1;
+constexpr double kShadowSpread = 1.5;
 
 /// `height`: of a direction of unit length.
 Color skyRadiance(double height) {
@@ -65,6 +66,14 @@ trk::Volume openLevel(const std::string& path, const LitOptions& lit) {
     options.scale = lit.scale;
     options.color = lit.color;
     return trk::openVolume(path.c_str(), "", options);
+}
+
+/// One of `count` directions spread evenly over the sphere.
+Vec3d spreadDirection(int i, int count) {
+    const double y = 1 - (2 * i + 1.0) / count;
+    const double angle = 2.39996322972865332 * i;  // the golden angle
+    const double r = std::sqrt(1 - y * y);
+    return {{r * std::cos(angle), y, r * std::sin(angle)}};
 }
 
 /// In how many stretches a cell, or a constant region, is lit: more where much is absorbed, as most
@@ -146,31 +155,27 @@ LitPreview::LitPreview(const std::string& sidecarPath, const LitOptions& options
 std::vector<LitPreview::Source> LitPreview::makeSources(const LitOptions& options) {
     constexpr double kDegree = 3.14159265358979323846 / 180;
     std::vector<Source> list;
-    // A wide sun, as several directions: from one alone, its shadows would show the grid of the
-    // places that light is computed for.
+    // A wide sun, as several directions, and each of all directions from a place of its own around
+    // the one that light is computed for: from that alone, shadows would show the grid of those
+    // places.
+    const auto add = [&](const Vec3d& towards, const Vec3d& offset, Color radiance, int count) {
+        for (double& c : radiance) {
+            c /= count;
+        }
+        list.push_back({toWorld(options.up, towards), kShadowSpread * offset, radiance});
+    };
     for (int i = 0; i < kSunDirections; ++i) {
         const double turn = 2 * kDegree * 180 * i / kSunDirections;
         const double azimuth = kDegree * (options.azimuth + kSunRadius * std::cos(turn));
         const double elevation = kDegree * (options.elevation + kSunRadius * std::sin(turn));
-        Color radiance = kSun;
-        for (double& c : radiance) {
-            c /= kSunDirections;
-        }
-        list.push_back(
-            {toWorld(options.up, {{std::cos(elevation) * std::sin(azimuth), std::sin(elevation),
-                                   std::cos(elevation) * std::cos(azimuth)}}),
-             radiance});
+        add({{std::cos(elevation) * std::sin(azimuth), std::sin(elevation),
+              std::cos(elevation) * std::cos(azimuth)}},
+            spreadDirection(i, kSunDirections), kSun, kSunDirections);
     }
     for (int i = 0; i < kSkyDirections; ++i) {
-        const double y = 1 - (2 * i + 1.0) / kSkyDirections;
-        const double angle = 2.39996322972865332 * i;  // the golden angle
-        const double r = std::sqrt(1 - y * y);
-        Color radiance = skyRadiance(y);
-        for (double& c : radiance) {
-            c /= kSkyDirections;
-        }
-        list.push_back(
-            {toWorld(options.up, {{r * std::cos(angle), y, r * std::sin(angle)}}), radiance});
+        const Vec3d towards = spreadDirection(i, kSkyDirections);
+        add(towards, spreadDirection((7 * i) % kSkyDirections, kSkyDirections),
+            skyRadiance(towards[1]), kSkyDirections);
     }
     return list;
 }
@@ -181,12 +186,12 @@ LitPreview::Light LitPreview::computeLight(const Vec3d& local) const {
     for (int a = 0; a < 3; ++a) {
         index[a] += static_cast<double>(volume_.anchor[static_cast<size_t>(a)]);
     }
-    const Vec3d world = volume_.indexToWorld.point(index);
     Color sum{};
     trk::withVariant(volume_, trk::ControlKind::kConstant, [&](auto variant) {
         using V = decltype(variant);
         const typename V::Extinction extinction(volume_);
         for (const Source& source : sources_) {
+            const Vec3d world = volume_.indexToWorld.point(index + source.offset);
             TrkRay ray;
             for (int a = 0; a < 3; ++a) {
                 ray.origin[a] = static_cast<float>(world[a]);

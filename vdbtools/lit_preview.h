@@ -75,6 +75,7 @@ class LitPreview {
     /// Light from one direction.
     struct Source {
         trk::Vec3d towards;  ///< world space
+        trk::Vec3d offset;   ///< index space, of where its shadow is looked for
         std::array<double, 3> radiance;
     };
 

@@ -3,7 +3,10 @@
 
 #include <algorithm>
 #include <array>
+#include <charconv>
 #include <cmath>
+#include <cstdio>
+#include <cstring>
 #include <vector>
 
 namespace vdbtools {
@@ -37,9 +40,13 @@ double depthThrough(const ExtinctionField& field, const Vec3d& place, int axis, 
     return sum * voxel;
 }
 
+/// The nearest number of two digits, as it is written.
 double twoDigits(double value) {
-    const double unit = std::pow(10.0, std::floor(std::log10(value)) - 1);
-    return std::round(value / unit) * unit;
+    char text[32];
+    std::snprintf(text, sizeof(text), "%.1e", value);
+    double result = value;
+    std::from_chars(text, text + std::strlen(text), result);
+    return result;
 }
 
 }  // namespace

@@ -60,12 +60,14 @@ TrkStatus guard(const Body& body) noexcept {
     throw trk::Error(TRK_ERROR_INVALID_ARGUMENT, message);
 }
 
+/// No struct will ever be as large.
+constexpr size_t kAbsurd = 1 << 16;
+
 /// What the caller filled in, completed: of an older, smaller struct the rest is 0, the default of
 /// fields added later; of a newer, larger one the rest must be. `firstSize`: of the first release.
 template <class Struct>
 Struct completed(const Struct& given, const char* what, size_t firstSize) {
     const size_t size = given.size;
-    constexpr size_t kAbsurd = 1 << 16;
     if (size < firstSize || size > kAbsurd) {
         refuse(std::string(what) + ".size is " + std::to_string(size) + "; expected " +
                std::to_string(sizeof(Struct)) + ", its sizeof");
@@ -84,9 +86,12 @@ Struct completed(const Struct& given, const char* what, size_t firstSize) {
     return result;
 }
 
-// Where the structs of the first release, 0.1, end: their last fields. These never change.
-constexpr size_t kFirstVolumeOptions = offsetof(TrkVolumeOptions, threads) + sizeof(int32_t);
-constexpr size_t kFirstQuery = offsetof(TrkQuery, threads) + sizeof(int32_t);
+// Where the structs of the first release, 0.1, end: their last fields. These never change, and none
+// leaves padding at its end, which a field of a later release might take for itself.
+constexpr size_t kFirstVolumeOptions = offsetof(TrkVolumeOptions, maxMemory) + sizeof(uint64_t);
+constexpr size_t kFirstQuery = offsetof(TrkQuery, resultStride) + sizeof(size_t);
+static_assert(kFirstVolumeOptions % alignof(TrkVolumeOptions) == 0 &&
+              kFirstQuery % alignof(TrkQuery) == 0);
 constexpr size_t kFirstStatistics = offsetof(TrkStatistics, exactShareStride) + sizeof(size_t);
 constexpr size_t kFirstFreePaths = offsetof(TrkFreePaths, lookupsStride) + sizeof(size_t);
 constexpr size_t kFirstVolumeInfo = offsetof(TrkVolumeInfo, storage) + sizeof(const char*);
@@ -114,6 +119,9 @@ trk::VolumeOptions checked(const TrkVolumeOptions& options) {
     }
     if (options.threads < 0) {
         refuse("threads is " + std::to_string(options.threads) + "; expected 0 (all) or more");
+    }
+    if (options.reserved != 0) {
+        refuse("reserved is " + std::to_string(options.reserved) + "; expected 0");
     }
     trk::VolumeOptions result;
     result.gridNamed = options.gridName != nullptr;
@@ -212,7 +220,8 @@ void checkPointers(const TrkVolume* volume, const void* rays, size_t rayCount,
         refuse("rays is NULL; expected " + std::to_string(rayCount) + " rays");
     }
     if (rayCount > 0 && !results) {
-        refuse("the result array is NULL; expected room for " + std::to_string(rayCount) + " rays");
+        refuse("where to put the results is NULL; expected room for " + std::to_string(rayCount) +
+               " rays");
     }
 }
 
@@ -297,7 +306,7 @@ TrkStatus trkGetVolumeInfo(const TrkVolume* handle, TrkVolumeInfo* info) {
             refuse("volume or info is NULL");
         }
         const size_t size = info->size;
-        if (size < kFirstVolumeInfo) {
+        if (size < kFirstVolumeInfo || size > kAbsurd) {
             refuse("TrkVolumeInfo.size is " + std::to_string(size) + "; expected " +
                    std::to_string(sizeof(TrkVolumeInfo)) + ", its sizeof, set before the call");
         }
@@ -341,6 +350,9 @@ TrkStatus trkEstimateTransmittance(const TrkVolume* volume, const TrkQuery* quer
     return guard([&] {
         checkPointers(volume, rays, rayCount, transmittance);
         const TrkQuery complete = checked(query, TRK_METHOD_RESIDUAL);
+        if (rayCount == 0) {
+            return;
+        }
         const size_t channels = volume->volume.channels();
         trk::estimateTransmittance(
             volume->volume, complete, rays, rayCount,
@@ -358,6 +370,9 @@ TrkStatus trkIntegrateOpticalDepth(const TrkVolume* volume, const TrkQuery* quer
             refuse("method " + std::to_string(complete.method) +
                    " is random and has no optical depth; expected TRK_METHOD_EXACT or "
                    "TRK_METHOD_CONTROL");
+        }
+        if (rayCount == 0) {
+            return;
         }
         trk::integrateOpticalDepth(volume->volume, complete, rays, rayCount,
                                    arrayOf("resultStride", opticalDepth, volume->volume.channels(),

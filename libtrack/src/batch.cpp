@@ -32,21 +32,22 @@ void checkRays(const TrkQuery& query, const TrkRay* rays, size_t rayCount) {
     }
 }
 
-void requireDensity(const Volume& volume) {
+void requireDensity(const Volume& volume, const char* instead) {
     if (!volume.hasDensity()) {
         throw Error(TRK_ERROR_NO_DENSITY,
                     volume.sidecarPath +
                         ": opened without its density, which this looks up; open the density's "
-                        ".vdb too, or use TRK_METHOD_CONTROL");
+                        ".vdb too" +
+                        instead);
     }
 }
 
-void requireSuperVoxels(const Volume& volume) {
+void requireSuperVoxels(const Volume& volume, const char* instead) {
     if (!volume.hasSuperVoxels) {
         throw Error(TRK_ERROR_NO_SIDECAR,
                     "grid " + volume.grid.name + ": this needs a sidecar, and none was found" +
                         (volume.sidecarPath.empty() ? "" : " at " + volume.sidecarPath) +
-                        "; bake one, or use TRK_METHOD_EXACT");
+                        "; bake one" + instead);
     }
 }
 

@@ -59,9 +59,10 @@ inline TrackingSettings trackingSettings(const TrkQuery& query, double lengthPer
 /// Throws Error naming the first ray that is none.
 void checkRays(const TrkQuery& query, const TrkRay* rays, size_t rayCount);
 
-/// Throw Error, saying how to get it, where the volume has no density, or no super-voxels.
-void requireDensity(const Volume& volume);
-void requireSuperVoxels(const Volume& volume);
+/// Throw Error, saying how to get it (and what else would do, `instead`), where the volume has no
+/// density, or no super-voxels.
+void requireDensity(const Volume& volume, const char* instead);
+void requireSuperVoxels(const Volume& volume, const char* instead);
 
 /// Runs body(i) for every ray: in this thread for one ray or one thread, else over TBB.
 template <class Body>

@@ -39,8 +39,9 @@ void sampleOne(const Volume& volume, const TrkQuery& query, const TrkRay& ray, s
     t = std::numeric_limits<float>::infinity();
     if (path.collided) {
         // Finite, as infinity says that it escapes.
-        const double at = std::min(clipped->tStart + path.t * clipped->tPerVoxel,
-                                   static_cast<double>(std::numeric_limits<float>::max()));
+        constexpr auto kLargest = static_cast<double>(std::numeric_limits<float>::max());
+        const double at =
+            std::min(std::max(clipped->tStart + path.t * clipped->tPerVoxel, -kLargest), kLargest);
         t = std::min(std::max(static_cast<float>(at), ray.tMin), ray.tMax);
     }
     const auto toFloat = [](double value) { return static_cast<float>(value); };
@@ -72,8 +73,8 @@ bool contains(const IntBox& box, const Vec3d& point) {
 
 void sampleFreePaths(const Volume& volume, const TrkQuery& query, const TrkRay* rays,
                      size_t rayCount, const FreePathOutput& paths) {
-    requireDensity(volume);
-    requireSuperVoxels(volume);
+    requireDensity(volume, "");
+    requireSuperVoxels(volume, "");
     checkRays(query, rays, rayCount);
     withVariant(volume, ControlKind::kConstant, [&](auto variant) {
         using V = decltype(variant);
@@ -84,7 +85,7 @@ void sampleFreePaths(const Volume& volume, const TrkQuery& query, const TrkRay* 
 
 void sampleExtinction(const Volume& volume, const Array<const float>& points, size_t pointCount,
                       const Array<float>& extinction) {
-    requireDensity(volume);
+    requireDensity(volume, "");
     for (size_t i = 0; i < pointCount; ++i) {
         const float* p = points.at(i);
         if (!std::isfinite(p[0]) || !std::isfinite(p[1]) || !std::isfinite(p[2])) {

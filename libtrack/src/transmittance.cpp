@@ -21,10 +21,11 @@ namespace {
 
 void checkMethod(const Volume& volume, const TrkQuery& query) {
     if (query.method != TRK_METHOD_CONTROL) {
-        requireDensity(volume);
+        requireDensity(volume, "; or use TRK_METHOD_CONTROL");
     }
     if (query.method != TRK_METHOD_EXACT && query.method != TRK_METHOD_MARCH) {
-        requireSuperVoxels(volume);
+        requireSuperVoxels(volume,
+                           query.method == TRK_METHOD_CONTROL ? "" : ", or use TRK_METHOD_EXACT");
     }
     if (query.method == TRK_METHOD_CONTROL && query.level > volume.superVoxels.levelCount()) {
         throw Error(TRK_ERROR_INVALID_ARGUMENT,
@@ -138,10 +139,10 @@ float toFloat(double value) {
     return static_cast<float>(std::fmin(std::fmax(value, -kLimit), kLimit));
 }
 
-/// As float; what is not 0 stays so.
+/// As float; what is not 0 stays so, also in a host that flushes denormals.
 float roundedError(double value) {
     const auto error = static_cast<float>(value);
-    return value > 0 ? std::max(error, std::numeric_limits<float>::denorm_min()) : error;
+    return value > 0 ? std::max(error, std::numeric_limits<float>::min()) : error;
 }
 
 template <class V>
@@ -167,6 +168,11 @@ void estimateRay(const Volume& volume, const TrkQuery& query, const TrkRay& ray,
     const bool biased = query.method == TRK_METHOD_CONTROL || query.method == TRK_METHOD_MARCH;
     if (biased && clippedLength > 0) {
         estimate.standardError.fill(kNaN);
+    }
+    for (size_t c = 0; c < C; ++c) {
+        if (volume.scales[c] == 0) {  // exactly 1, whatever the other channels met
+            estimate.standardError[c] = 0;
+        }
     }
     std::transform(estimate.mean.begin(), estimate.mean.end(), transmittance.at(i), toFloat);
     if (statistics.standardError) {

@@ -10,6 +10,7 @@
 #include <filesystem>
 #include <limits>
 #include <sstream>
+#include <system_error>
 #include <utility>
 
 namespace trk {
@@ -168,7 +169,8 @@ Volume openVolume(const char* vdbPath, const char* sidecarPath, const VolumeOpti
         throw Error(TRK_ERROR_INVALID_ARGUMENT,
                     "neither a density nor a sidecar was named; expected at least one path");
     }
-    const bool haveSidecar = named || (wanted && std::filesystem::exists(path));
+    std::error_code ignored;  // of a name too long, say: then it does not exist
+    const bool haveSidecar = named || (wanted && std::filesystem::exists(path, ignored));
 
     Sidecar sidecar;
     if (haveSidecar) {

@@ -7,6 +7,7 @@
 #include "support/rays.h"
 
 #include <gtest/gtest.h>
+#include <immintrin.h>
 #include <tbb/parallel_for.h>
 #include <tbb/task_group.h>
 
@@ -156,7 +157,7 @@ TEST(Host, StructsOfNewerHeadersAreTakenWhereTheRestIsZero) {
 TEST(Host, StructsTooSmallToBeAnyAreRefused) {
     const track::Volume volume = openCloud();
     TrkVolumeInfo info = {};
-    for (const size_t size : {size_t{0}, size_t{8}, sizeof(info) - 8}) {
+    for (const size_t size : {size_t{0}, size_t{8}, sizeof(info) - 8, size_t{1} << 40}) {
         info.size = size;
         EXPECT_EQ(trkGetVolumeInfo(volume.handle(), &info), TRK_ERROR_INVALID_ARGUMENT);
         EXPECT_NE(std::string(trkGetLastErrorMessage()).find("TrkVolumeInfo.size"),
@@ -255,6 +256,33 @@ TEST(Host, ResultsAndStatisticsMayBeStrided) {
     EXPECT_EQ(
         trkEstimateTransmittance(volume.handle(), &query, all.data(), 1, dense.data(), nullptr),
         TRK_ERROR_INVALID_ARGUMENT);
+}
+
+// A host may flush denormals: no estimate becomes certain by that.
+TEST(Host, NoErrorIsFlushedToZero) {
+    const track::Volume volume = openCloud(30);
+    const std::vector<TrkRay> all = rays::through(rays::boundsOf(volume.info()), 3000, 20, 1);
+    track::Query exact(0, 0);
+    exact.method = TRK_METHOD_EXACT;
+    std::vector<float> expected(all.size());
+    volume.estimateTransmittance(exact, all.data(), all.size(), expected.data());
+    track::Query query(0, 0);
+    query.method = TRK_METHOD_RATIO;
+    query.samples = 16;
+    query.flags = 0;
+    query.threads = 1;
+    std::vector<float> found(all.size());
+    track::Statistics statistics(all.size(), 1);
+    const unsigned mode = _mm_getcsr();
+    _mm_setcsr(mode | 0x8040);  // flush to zero, denormals are zero
+    volume.estimateTransmittance(query, all.data(), all.size(), found.data(), statistics.view());
+    _mm_setcsr(mode);
+    size_t tiny = 0;
+    for (size_t i = 0; i < all.size(); ++i) {
+        EXPECT_FALSE(statistics.standardError[i] == 0 && found[i] == 0 && expected[i] > 0) << i;
+        tiny += expected[i] > 0 && expected[i] < 1e-30f ? 1 : 0;
+    }
+    EXPECT_GT(tiny, 10u);
 }
 
 // What the README shows: samples of a pixel, and pixels, have numbers of their own.

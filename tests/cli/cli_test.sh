@@ -318,6 +318,8 @@ case_query_output() {
     expect 0 query cloud.vdb --rays rays.csv --method residual --error 0.2 --scale 0.3
     [ "$(head -n 1 stdout)" = "ray,transmittance,stderr,optical_depth,lookups,samples" ] || fail "header"
     awk -F, 'NR == 2 && !($3 > 0 && $3 <= 0.2 && $6 > 0) { exit 1 }' stdout || fail "--error: $(cat stdout)"
+    expect 0 query cloud.vdb --rays rays.csv --method ratio --error 0.001 --samples 2 --scale 0.01
+    contains stderr "not reach --error 0.001 within --samples"
     expect 0 query cloud.vdb --rays rays.csv --method residual --error 1e-5
     awk -F, 'NR == 2 && !($3 == 0 && $6 == 0 && $4 > 0) { exit 1 }' stdout || fail "exact: $(cat stdout)"
     expect 0 query cloud.vdb --rays rays.csv --method control --level 1
@@ -404,6 +406,17 @@ case_bad_rays() {
     bad 'ox,oy,oz,dx,dy\n0,0,0,1,0\n' "none named dz"
     bad 'ox,oy,oz,dx,dy,dz,tmin\n0,0,0,1,0,0,0\n' "none named tmax"
     bad 'ox,oy,oz,dx,dy,dz\nx,0,0,1,0,0\n' 'line 2: expected 6 numbers, as the header names, found "x,0,0,1,0,0"'
+    bad 'ox,oy,oz,dx,dy,dzz\n0,0,0,1,0,0\n' 'found "dzz" in "ox,oy'
+    expect 1 query cloud.vdb --rays .
+    one_line ".: is a directory; expected a CSV file"
+    # Neither an output over the sidecar that is found, nor exact for want of one that is none.
+    expect 1 query cloud.vdb --rays crlf.csv -o cloud.track.vdb --force --method residual
+    one_line "is an input"
+    mv cloud.track.vdb kept
+    echo junk >cloud.track.vdb
+    printf -- '-5,4,5,1,0.02,0.01\n' >one.csv
+    expect 0 query cloud.vdb --rays one.csv
+    mv kept cloud.track.vdb
     bad 'ox,oy,oz,dx,dy,dz\n0,0,0,1,0,0,0,1\n' "found 8 numbers"
     bad '0,0,0,1,0,0,2,1\n' "line 1: expected tmin <= tmax, found tmin 2 and tmax 1"
     # A header's order counts.
@@ -584,11 +597,12 @@ case_two_bakes_at_once() {
 case_json() {
     baked_cloud
     expect 0 info cloud.vdb --json
-    contains stdout '"can_be_baked": true'
+    contains stdout '"can_be_baked": null'
     contains stdout '"claimed_active_voxels"'
     grep -q brick_bytes stdout && fail "voxels are read unasked"
     expect 0 info cloud.vdb --json --values
     contains stdout '"active_voxels"'
+    contains stdout '"can_be_baked": true'
     contains stdout '"bounds_min"'
     expect 0 info cloud.track.vdb --json
     contains stdout '"super_voxel_size": 8'

@@ -394,6 +394,7 @@ TEST(LoadDensity, ReadsFilesOfVersion225) {
     std::string half = bytes;
     const std::string name("\x10\0\0\0Tree_float_5_4_3", 20);
     half.replace(half.find(name), name.size(), std::string("\x0f\0\0\0Tree_half_5_4_3", 19));
+    half += '\0';  // as long as its directory says
     expectFailure(asVersion(half, 225, 13, "half.vdb"), TRK_ERROR_UNSUPPORTED_GRID,
                   "native halfs, which OpenVDB 13 writes");
 }

@@ -10,7 +10,9 @@
 
 #include <gtest/gtest.h>
 
+#include <cstdio>
 #include <cstring>
+#include <ctime>
 #include <filesystem>
 #include <functional>
 #include <map>
@@ -302,6 +304,46 @@ TEST(Sidecar, OfASmallVolumeIsSmallWhereverThatLies) {
             EXPECT_LE(alone.header.origin[a], offset[axis] - 1);
         }
     }
+}
+
+// OpenVDB's own way of making a map loses its scale where the translation is large.
+TEST(Sidecar, FitsItsDensityAnywhereAndAtAnyVoxelSize) {
+    for (const double voxel : {0.1, 0.3, 1e-3, 7e5}) {
+        for (const int offset : {1000000, 50000000, 1000000000, 2147000000}) {
+            const auto ball = ballAt(20, Coord(offset, -offset, 5));
+            ball->setTransform(openvdb::math::Transform::createLinearTransform(voxel));
+            const std::string vdb = fixtures::write("far-ball.vdb", {ball});
+            const std::string sidecar = fixtures::path("far-ball.track.vdb");
+            fixtures::bake(vdb, sidecar, 16, 2);
+            const trk::Density density = fixtures::load(vdb);
+            EXPECT_NO_THROW(trk::readSidecar(sidecar, &density.summary, TRK_CHECK_FULL))
+                << voxel << " " << offset;
+            const trk::Sidecar alone = trk::readSidecar(sidecar, nullptr, TRK_CHECK_FULL);
+            for (int a = 0; a < 3; ++a) {
+                EXPECT_EQ(alone.header.indexToWorld.linear[a][a], voxel);
+                EXPECT_NEAR(alone.header.indexToWorld.translation[a], 0, 1e-6 * voxel);
+            }
+        }
+    }
+}
+
+// Empty space costs nothing to read, wherever the grids' own corner lies.
+TEST(Sidecar, OfVoxelsAtTheEndsOfTheWorldOpensInNoTime) {
+    auto grid = openvdb::FloatGrid::create();
+    grid->setName("density");
+    for (const Coord& at : {Coord(-2000000000, 5, 1999999999), Coord(3), Coord(100000),
+                            Coord(2000000000, -2000000000, 7)}) {
+        grid->tree().setValue(at, 1.0f);
+    }
+    const std::string vdb = fixtures::write("ends.vdb", {grid});
+    const std::string sidecar = fixtures::path("ends.track.vdb");
+    fixtures::bake(vdb, sidecar, 16, 4);
+    const trk::Density density = fixtures::load(vdb);
+    const std::clock_t start = std::clock();
+    const trk::Sidecar read = trk::readSidecar(sidecar, &density.summary, TRK_CHECK_FULL);
+    std::printf("%.3f s\n", static_cast<double>(std::clock() - start) / CLOCKS_PER_SEC);
+    EXPECT_EQ(read.baked.table.occupiedItems(),
+              vdbtools::bake(density.field, fixtures::bakeOptions(16, 4)).table.occupiedItems());
 }
 
 TEST(Sidecar, GradientsAreOfEveryKindAndReadBack) {

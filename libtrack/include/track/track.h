@@ -141,8 +141,9 @@ typedef struct TrkVolumeOptions {
                              super-voxels as baked. Experimental: there to compare with */
     TrkCheck check;     /**< how far to distrust the sidecar */
     uint32_t repair;    /**< TRK_REPAIR_… bits; those the sidecar was baked with are added */
-    uint64_t maxMemory; /**< refuse to hold more bytes than this; 0: no limit */
     int32_t threads;    /**< threads used for opening; 0: all */
+    uint32_t reserved;  /**< 0 */
+    uint64_t maxMemory; /**< refuse to hold more bytes than this; 0: no limit */
 } TrkVolumeOptions;
 
 static inline TrkVolumeOptions trkDefaultVolumeOptions(void) {
@@ -155,8 +156,9 @@ static inline TrkVolumeOptions trkDefaultVolumeOptions(void) {
     options.global = 0;
     options.check = TRK_CHECK_FULL;
     options.repair = 0;
-    options.maxMemory = 0;
     options.threads = 0;
+    options.reserved = 0;
+    options.maxMemory = 0;
     return options;
 }
 
@@ -193,6 +195,7 @@ typedef struct TrkQuery {
     float step;           /**< of TRK_METHOD_MARCH: voxel lengths between look-ups; >= 0.001 */
     uint32_t level;       /**< of TRK_METHOD_CONTROL: 0 the baked super-voxels, k 2^k larger ones */
     uint32_t flags;       /**< TRK_QUERY_… bits */
+    int32_t threads;      /**< 0: all, 1: the calling thread alone, n: at most n */
     uint64_t seed;        /**< of the random numbers */
     uint64_t stream;      /**< see above */
     uint64_t firstRayId;  /**< ray i has id firstRayId + i, unless rayIds is given */
@@ -200,7 +203,6 @@ typedef struct TrkQuery {
     size_t rayStride;       /**< bytes from one TrkRay to the next; 0: sizeof(TrkRay) */
     size_t resultStride;    /**< bytes from one ray's transmittance or optical depth to the next
                                  ray's; 0: those of its channels */
-    int32_t threads;        /**< 0: all, 1: the calling thread alone, n: at most n */
 } TrkQuery;
 
 static inline TrkQuery trkDefaultQuery(void) {
@@ -213,13 +215,13 @@ static inline TrkQuery trkDefaultQuery(void) {
     query.step = 1.0f;
     query.level = 0;
     query.flags = (uint32_t)TRK_QUERY_EXACT_FALLBACK | (uint32_t)TRK_QUERY_ROULETTE;
+    query.threads = 0;
     query.seed = 0;
     query.stream = 0;
     query.firstRayId = 0;
     query.rayIds = NULL;
     query.rayStride = 0;
     query.resultStride = 0;
-    query.threads = 0;
     return query;
 }
 

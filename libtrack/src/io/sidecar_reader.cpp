@@ -233,6 +233,9 @@ class SidecarReader {
                                               : item.mean);
             }
             baked.items.push_back(item);
+            if (item.min > item.max) {  // nothing could be tracked between them
+                badSidecar(file_.path(), where(at) + " has a min above its max");
+            }
             if (check_ == TRK_CHECK_FULL) {
                 checkItem(item, baked.control(baked.items.size() - 1), at);
             }

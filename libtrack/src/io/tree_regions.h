@@ -93,43 +93,78 @@ class TreeRegions {
     }
 
   private:
-    /// The same for a region that is not aligned with nodes of its size: whether all that it meets,
-    /// of the next size that has nodes, is the same.
-    std::optional<Region> uniformAcross(const Int3& origin, int shift) {
-        const int64_t size = int64_t{1} << shift;
-        const int partShift = shift <= kLeafShift    ? 0
-                              : shift <= kLowerShift ? kLeafShift
-                                                     : kLowerShift;
-        if (partShift == 0) {
-            return std::nullopt;  // as soon asked voxel by voxel
-        }
-        // Where everything that it meets is one larger node's tile, that is soon seen.
-        std::optional<Region> expected;
-        const int64_t part = int64_t{1} << partShift;
-        Int3 first;
-        for (size_t a = 0; a < 3; ++a) {
-            first[a] = origin[a] & ~(part - 1);
-        }
-        for (Int3 at = first; at[0] < origin[0] + size; at[0] += part) {
-            for (at[1] = first[1]; at[1] < origin[1] + size; at[1] += part) {
-                for (at[2] = first[2]; at[2] < origin[2] + size; at[2] += part) {
-                    const auto found = uniform(at, partShift);
-                    if (!found || (expected && (!(found->value == expected->value) ||
-                                                found->active != expected->active))) {
-                        return std::nullopt;
-                    }
-                    expected = found;
-                }
-            }
-        }
-        return expected;
-    }
-
     using Upper = typename TreeType::RootNodeType::ChildNodeType;  // 4096^3 voxels
     using Lower = typename Upper::ChildNodeType;                   // 128^3 voxels
     static constexpr int kUpperShift = 12;
     static constexpr int kLowerShift = 7;
     static constexpr int kLeafShift = 3;
+
+    /// The same for a region that is not aligned with nodes of its size: whether all the tiles that
+    /// it meets agree, and no leaf is among them. Only where there are nodes are their parts looked
+    /// at.
+    std::optional<Region> uniformAcross(const Int3& origin, int shift) {
+        Int3 end;
+        for (size_t a = 0; a < 3; ++a) {
+            end[a] = origin[a] + (int64_t{1} << shift);
+        }
+        std::optional<Region> expected;
+        const auto agrees = [&](const Region& found) {
+            const bool same =
+                !expected || (found.value == expected->value && found.active == expected->active);
+            expected = found;
+            return same;
+        };
+        const auto inLower = [&](const Lower& lower, const Int3& lo, const Int3& hi) {
+            return forEachBlock(lo, hi, kLeafShift, [&](const Int3& at, const Int3&) {
+                const auto tile = uniformTiles(lower, coord(at), kLeafShift, kLeafShift);
+                return tile && agrees(*tile);
+            });
+        };
+        const auto inUpper = [&](const Upper& upper, const Int3& lo, const Int3& hi) {
+            return forEachBlock(lo, hi, kLowerShift, [&](const Int3& at, const Int3& blockEnd) {
+                if (const auto tile = uniformTiles(upper, coord(at), kLowerShift, kLowerShift)) {
+                    return agrees(*tile);
+                }
+                return inLower(*accessor_.template probeConstNode<Lower>(coord(at)), at, blockEnd);
+            });
+        };
+        const bool uniform =
+            forEachBlock(origin, end, kUpperShift, [&](const Int3& at, const Int3& blockEnd) {
+                if (!inRange(at)) {
+                    return agrees({tree_.background(), false});
+                }
+                if (const auto* upper = accessor_.template probeConstNode<Upper>(coord(at))) {
+                    return inUpper(*upper, at, blockEnd);
+                }
+                Region region{};
+                region.active = accessor_.probeValue(coord(at), region.value);
+                return agrees(region);
+            });
+        return uniform ? expected : std::nullopt;
+    }
+
+    /// Calls f(first place, end) for the part of the box in every aligned block of 2^shift, until
+    /// it answers false; whether it never did.
+    template <class F>
+    static bool forEachBlock(const Int3& lo, const Int3& hi, int shift, const F& f) {
+        const int64_t size = int64_t{1} << shift;
+        const auto next = [size](int64_t x) { return (x & ~(size - 1)) + size; };
+        Int3 at;
+        for (at[0] = lo[0]; at[0] < hi[0]; at[0] = next(at[0])) {
+            for (at[1] = lo[1]; at[1] < hi[1]; at[1] = next(at[1])) {
+                for (at[2] = lo[2]; at[2] < hi[2]; at[2] = next(at[2])) {
+                    Int3 end;
+                    for (size_t a = 0; a < 3; ++a) {
+                        end[a] = std::min(next(at[a]), hi[a]);
+                    }
+                    if (!f(at, end)) {
+                        return false;
+                    }
+                }
+            }
+        }
+        return true;
+    }
 
     static bool inRange(const Int3& p) {
         return std::all_of(p.begin(), p.end(), [](int64_t x) {

@@ -16,6 +16,7 @@
 #include <filesystem>
 #include <istream>
 #include <map>
+#include <sstream>
 #include <utility>
 
 namespace trk {
@@ -95,7 +96,8 @@ class VdbFile::Archive : public openvdb::io::Archive {
         }
     }
 
-    void readHead(const std::string& path, VdbFileHeader& header, std::vector<VdbEntry>& entries) {
+    void readHead(const std::string& path, uint64_t bytes, VdbFileHeader& header,
+                  std::vector<VdbEntry>& entries) {
         header.version = checkMagic(path);
         stream_.exceptions(std::ios::badbit | std::ios::failbit | std::ios::eofbit);
         readHeader(stream_);
@@ -120,6 +122,10 @@ class VdbFile::Archive : public openvdb::io::Archive {
                 // ever.
                 if (offsets[0] < static_cast<int64_t>(stream_.tellg()) || offsets[2] < offsets[0]) {
                     badFile(path, "damaged: grid " + entry.name + " ends before it begins");
+                }
+                if (static_cast<uint64_t>(offsets[2]) > bytes) {
+                    badFile(path, "the file ends early, before grid " + entry.name +
+                                      " does (truncated or damaged)");
                 }
                 entry.position = offsets[0];
                 stream_.seekg(offsets[0]);
@@ -303,7 +309,7 @@ VdbFile::VdbFile(const std::string& path) : path_(path) {
         bytes_ = static_cast<uint64_t>(info.st_size);
         modified_ = int64_t{info.st_mtim.tv_sec} * 1000000000 + info.st_mtim.tv_nsec;
     }
-    reading(path, [&] { archive_->readHead(path, header_, entries_); });
+    reading(path, [&] { archive_->readHead(path, bytes_, header_, entries_); });
     std::map<std::string, int> counts;
     for (VdbEntry& entry : entries_) {
         entry.index = counts[entry.name]++;
@@ -411,7 +417,26 @@ openvdb::math::Transform::Ptr makeTransform(const AffineMap& map) {
         }
         matrix(3, row) = map.translation[row];
     }
-    return openvdb::math::Transform::createLinearTransform(matrix);
+    const auto& m = map.linear;
+    const bool straight = m[0][1] == 0 && m[0][2] == 0 && m[1][0] == 0 && m[1][2] == 0 &&
+                          m[2][0] == 0 && m[2][1] == 0;
+    openvdb::math::MapBase::Ptr base;
+    if (straight) {
+        base.reset(new openvdb::math::ScaleTranslateMap(
+            openvdb::Vec3d(m[0][0], m[1][1], m[2][2]),
+            openvdb::Vec3d(map.translation[0], map.translation[1], map.translation[2])));
+    } else {
+        base.reset(new openvdb::math::AffineMap(matrix));
+    }
+    // Every constructor of a Transform finds the scale of a map without rotation as the difference
+    // of two points, and loses it where the translation is large. Reading one takes it as it is.
+    std::stringstream stream(std::ios::in | std::ios::out | std::ios::binary);
+    openvdb::io::setCurrentVersion(stream);
+    openvdb::writeString(stream, base->type());
+    base->write(stream);
+    openvdb::math::Transform::Ptr transform(new openvdb::math::Transform);
+    transform->read(stream);
+    return transform;
 }
 
 }  // namespace trk

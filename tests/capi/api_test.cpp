@@ -158,7 +158,7 @@ TEST(Api, RefusesBadQueriesBeforeWritingAnything) {
         TRK_ERROR_INVALID_ARGUMENT, "rays is NULL");
     expectRefused(
         trkEstimateTransmittance(volume.handle(), nullptr, all.data(), 1, nullptr, nullptr),
-        TRK_ERROR_INVALID_ARGUMENT, "result array is NULL");
+        TRK_ERROR_INVALID_ARGUMENT, "results is NULL");
     double depth = 0;
     const track::Query random(0, 0);
     expectRefused(trkIntegrateOpticalDepth(volume.handle(), &random, all.data(), 1, &depth),

@@ -11,6 +11,7 @@
 #include <tbb/parallel_for.h>
 #include <tbb/task_group.h>
 
+#include <cstddef>
 #include <cstring>
 #include <string>
 #include <vector>
@@ -152,6 +153,24 @@ TEST(Host, StructsOfNewerHeadersAreTakenWhereTheRestIsZero) {
     EXPECT_EQ(info.later, 0u);
     EXPECT_EQ(info.known.superVoxelSize, 8u);
     EXPECT_EQ(info.known.size, sizeof(info));
+}
+
+TEST(Host, TheHeaderHasTheVersionOfTheLibrary) {
+    EXPECT_EQ(std::to_string(TRK_VERSION_MAJOR) + "." + std::to_string(TRK_VERSION_MINOR) + "." +
+                  std::to_string(TRK_VERSION_PATCH),
+              trkGetVersion());
+}
+
+// Padding would hold what happened to lie there, and a field of a later release could fall into it.
+TEST(Host, StructsAreFullOfFields) {
+    EXPECT_EQ(sizeof(TrkVolumeOptions), offsetof(TrkVolumeOptions, maxMemory) + sizeof(uint64_t));
+    EXPECT_EQ(sizeof(TrkQuery), offsetof(TrkQuery, resultStride) + sizeof(size_t));
+    EXPECT_EQ(offsetof(TrkQuery, seed), offsetof(TrkQuery, threads) + sizeof(int32_t));
+    EXPECT_EQ(sizeof(TrkVolumeInfo), offsetof(TrkVolumeInfo, storage) + sizeof(const char*));
+    TrkVolumeOptions options = trkDefaultVolumeOptions();
+    options.reserved = 1;
+    TrkVolume* volume = nullptr;
+    EXPECT_EQ(trkOpenVolume("x.vdb", "", &options, &volume), TRK_ERROR_INVALID_ARGUMENT);
 }
 
 TEST(Host, StructsTooSmallToBeAnyAreRefused) {

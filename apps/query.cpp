@@ -309,9 +309,13 @@ TrkVolumeOptions volumeOptionsOf(const Arguments& arguments) {
 /// What to open.
 struct Inputs {
     std::string density;  ///< empty: the sidecar alone
-    const char* sidecar;  ///< as trkOpenVolume takes it
     std::string sidecarPath;
     TrkVolumeOptions options;
+    bool named = false;   ///< the sidecar must be there
+    bool wanted = false;  ///< it is taken where it is
+
+    /// As trkOpenVolume takes it.
+    const char* sidecar() const { return named ? sidecarPath.c_str() : wanted ? nullptr : ""; }
 };
 
 /// What a bake was allowed to repair, so is a query that needs none; but it must not fail over a
@@ -327,7 +331,7 @@ uint32_t repairBeside(const std::string& sidecar) {
 /// The density with the sidecar that the method needs, or a sidecar alone.
 Inputs inputsOf(const Arguments& arguments, const TrkQuery& query,
                 const TrkVolumeOptions& options) {
-    Inputs inputs{arguments.text("IN.vdb"), nullptr, arguments.text("sidecar"), options};
+    Inputs inputs{arguments.text("IN.vdb"), arguments.text("sidecar"), options};
     const bool densityAlone = query.method == TRK_METHOD_EXACT || query.method == TRK_METHOD_MARCH;
     if (std::filesystem::exists(inputs.density) && trk::isSidecar(inputs.density)) {
         if (query.method != TRK_METHOD_CONTROL) {
@@ -361,9 +365,8 @@ Inputs inputsOf(const Arguments& arguments, const TrkQuery& query,
                              "; expected robust or mean, or --global");
         }
     }
-    inputs.sidecar = inputs.density.empty() || arguments.has("sidecar") ? inputs.sidecarPath.c_str()
-                     : useSidecar                                       ? nullptr
-                                                                        : "";
+    inputs.named = inputs.density.empty() || arguments.has("sidecar");
+    inputs.wanted = useSidecar;
     return inputs;
 }
 
@@ -377,7 +380,7 @@ trk::Volume openInside(const Inputs& inputs) {
     options.choice = inputs.options.choice;
     options.global = inputs.options.global != 0;
     options.repair = inputs.options.repair;
-    trk::Volume volume = trk::openVolume(inputs.density.c_str(), inputs.sidecar, options);
+    trk::Volume volume = trk::openVolume(inputs.density.c_str(), inputs.sidecar(), options);
     trk::requireSuperVoxels(volume, ", or use TRK_METHOD_EXACT");
     return volume;
 }
@@ -391,7 +394,7 @@ std::string answerRays(const Arguments& arguments, const track::Query& query, co
         return certainTransmittances(arguments, openInside(inputs), query, rays);
     }
     const track::Volume volume =
-        track::Volume::open(inputs.density, inputs.sidecar, inputs.options);
+        track::Volume::open(inputs.density, inputs.sidecar(), inputs.options);
     return arguments.flag("free-paths") ? freePaths(arguments, volume, query, rays)
                                         : transmittances(arguments, volume, query, rays);
 }
@@ -480,7 +483,7 @@ void run(const Command& command, const std::vector<std::string>& given) {
 const Command kQueryCommand{
     "query",
     "vdbtrack query IN.vdb|SIDECAR --rays RAYS.csv [--sidecar S] [--grid NAME] [--method exact] "
-    "[--free-paths] [--samples 64 | --error E] [--rate 1] [--rate-base majorant] [--step 1] "
+    "[--free-paths] [--samples 64] [--error E] [--rate 1] [--rate-base majorant] [--step 1] "
     "[--roulette] "
     "[--choice robust] [--global] [--level 0] [--seed 0] [--stream 0] [--scale 1] "
     "[--color 1,1,1] [-o OUT.csv] [--force]",

@@ -364,6 +364,7 @@ SweepBake bakeInto(Volumes::Bakes& bakes, const Source& source, int size, Contro
     BakeOptions options;
     options.superVoxelSize = size;
     options.kind = kind;
+    options.sidecarBytes = sidecarLimit(source.summary.fileBytes);
     const auto start = std::chrono::steady_clock::now();
     trk::BakedVolume& baked = bakes[{size, kind}] = bake(*source.field, options);
     SweepBake result;
@@ -378,7 +379,9 @@ SweepBake bakeInto(Volumes::Bakes& bakes, const Source& source, int size, Contro
     trk::writeSidecar(file, sidecarHeader(source.summary, *source.field, baked), baked,
                       source.summary.anchor);
     result.sidecarBytes = std::filesystem::file_size(file.path());
-    baked.levels.clear();  // no way looks at them
+    baked.levels.clear();  // no way looks at these
+    baked.gradients = {};
+    baked.preview = {};
     return result;
 }
 

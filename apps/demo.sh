@@ -76,7 +76,8 @@ done
 echo
 echo "How far the estimates lie from the exact values, in their standard errors (|z| above 3 is rare):"
 paste -d, "$out/exact.csv" "$out/residual.csv" | awk -F, 'NR > 1 {
-    printf "  ray %s: z = %s\n", $1, $8 > 0 ? sprintf("%+.2f", ($7 - $2) / $8) : "- (both exact)" }'
+    z = ($8 > 0) ? sprintf("%+.2f", ($7 - $2) / $8) : "- (both exact)"
+    print "  ray " $1 ": z = " z }'
 
 cat <<TEXT
 

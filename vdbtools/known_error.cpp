@@ -47,7 +47,7 @@ KnownErrorEstimate estimateWithKnownError(const trk::Volume& volume, const TrkQu
     trk::estimateTransmittance(volume, one, &ray, 1, {result.transmittance.data(), channels, 0},
                                statistics);
     for (size_t c = 0; c < channels && result.samples > 0; ++c) {
-        result.standardError[c] = static_cast<float>(std::sqrt(variance[c] / result.samples));
+        result.standardError[c] = trk::roundedError(std::sqrt(variance[c] / result.samples));
     }
     return result;
 }

@@ -9,6 +9,7 @@
 #include <algorithm>
 #include <cmath>
 #include <cstddef>
+#include <limits>
 #include <vector>
 
 namespace vdbtools {
@@ -16,6 +17,17 @@ namespace {
 
 using trk::ControlKind;
 using trk::Volume;
+
+/// T^2 (exp(noise) - 1). Where there is noise it is not 0, however deep.
+double varianceOf(double depth, double noise) {
+    if (noise == 0) {
+        return 0;
+    }
+    // Together where it is large, as the second factor alone may be too large.
+    const double variance = noise > 1 ? std::exp(noise - 2 * depth) - std::exp(-2 * depth)
+                                      : std::exp(-2 * depth) * std::expm1(noise);
+    return std::max(variance, std::numeric_limits<double>::min());
+}
 
 /// Integral of g over [t0, t1] by four Gauss points: exact for polynomials of degree 7.
 template <class G>
@@ -121,7 +133,7 @@ std::array<double, 3> predictVariance(const Volume& volume, const TrkQuery& quer
     const std::vector<double> depth = exactOpticalDepths(volume, {ray});
     if (query.method == TRK_METHOD_DELTA) {
         for (size_t c = 0; c < depth.size(); ++c) {
-            result[c] = -std::exp(-depth[c]) * std::expm1(-depth[c]);
+            result[c] = varianceOf(depth[c], depth[c]);  // T (1 - T)
         }
         return result;
     }
@@ -133,10 +145,7 @@ std::array<double, 3> predictVariance(const Volume& volume, const TrkQuery& quer
                 residual ? integrateNoise<V, trk::ResidualControl>(volume, query, *clipped)
                          : integrateNoise<V, trk::NoControl>(volume, query, *clipped);
             for (size_t c = 0; c < V::kChannels; ++c) {
-                // Together, as the second factor alone may be too large.
-                result[c] = noise[c] > 1
-                                ? std::exp(noise[c] - 2 * depth[c]) - std::exp(-2 * depth[c])
-                                : std::exp(-2 * depth[c]) * std::expm1(noise[c]);
+                result[c] = varianceOf(depth[c], noise[c]);
             }
         });
     return result;

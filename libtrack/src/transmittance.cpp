@@ -139,12 +139,6 @@ float toFloat(double value) {
     return static_cast<float>(std::fmin(std::fmax(value, -kLimit), kLimit));
 }
 
-/// As float; what is not 0 stays so, also in a host that flushes denormals.
-float roundedError(double value) {
-    const auto error = static_cast<float>(value);
-    return value > 0 ? std::max(error, std::numeric_limits<float>::min()) : error;
-}
-
 template <class V>
 void estimateRay(const Volume& volume, const TrkQuery& query, const TrkRay& ray, size_t i,
                  const Array<float>& transmittance, const StatisticsOutput& statistics) {
@@ -193,6 +187,11 @@ void estimateRay(const Volume& volume, const TrkQuery& query, const TrkRay& ray,
 }
 
 }  // namespace
+
+float roundedError(double value) {
+    const auto error = static_cast<float>(value);
+    return value > 0 ? std::max(error, std::numeric_limits<float>::min()) : error;
+}
 
 void estimateTransmittance(const Volume& volume, const TrkQuery& query, const TrkRay* rays,
                            size_t rayCount, const Array<float>& transmittance,

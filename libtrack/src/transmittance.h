@@ -16,6 +16,9 @@ struct StatisticsOutput {
     Array<float> exactShare;
 };
 
+/// A standard error as float; what is not 0 stays so, also in a host that flushes denormals.
+float roundedError(double value);
+
 /// As trkEstimateTransmittance, with `query` checked and complete. Throws Error before any result
 /// is written.
 void estimateTransmittance(const Volume& volume, const TrkQuery& query, const TrkRay* rays,

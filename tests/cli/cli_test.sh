@@ -4,6 +4,7 @@ set -uo pipefail
 
 vdbtrack=${1:?usage: cli_test.sh VDBTRACK CASE}
 data=${TRACK_TEST_DATA:-}
+project=$(realpath "$(dirname "$0")/../..")
 work=$(mktemp -d)
 trap 'rm -rf "$work"' EXIT
 cd "$work" || exit 1
@@ -314,6 +315,9 @@ case_query_output() {
     expect 0 query cloud.vdb --rays rays.csv --method march --step 0.05
     paste -d, exact.csv stdout | awk -F, 'NR > 1 { d = $2 - $7; if (d < 0) d = -d
         if (d > 1e-3) { print; exit 1 } }' >bad || fail "march: $(cat bad)"
+    # Too deep for a float, and random: the error is not 0.
+    expect 0 query cloud.vdb --rays rays.csv --method delta --scale 1000
+    awk -F, 'NR == 2 && !($2 == 0 && $3 > 0) { exit 1 }' stdout || fail "deep: $(cat stdout)"
     # As many samples as an error needs, or none where exact integration is cheaper.
     expect 0 query cloud.vdb --rays rays.csv --method residual --error 0.2 --scale 0.3
     [ "$(head -n 1 stdout)" = "ray,transmittance,stderr,optical_depth,lookups,samples" ] || fail "header"
@@ -616,6 +620,25 @@ case_json() {
     contains stdout '"de\tsity"'
     expect 0 info odd.vdb
     contains stdout 'de?sity'
+}
+
+# apps/demo.sh with the program built already: what it prints, and that a log given to it is kept.
+case_demo() {
+    mkdir -p demo/apps demo/build/demo/bin tools
+    cp "$project/apps/demo.sh" demo/apps
+    printf '#!/bin/sh\n' | tee tools/cmake demo/apps/install_packages.sh >/dev/null
+    chmod +x tools/cmake demo/apps/install_packages.sh
+    ln -s "$vdbtrack" demo/build/demo/bin/vdbtrack
+    small_cloud
+    echo "the log so far" >log
+    PATH=$work/tools:$PATH demo/apps/demo.sh cloud.vdb >>log 2>&1 || fail "demo: $(cat log)"
+    [ "$(head -n 1 log)" = "the log so far" ] || fail "the log was cut: $(head -n 3 log)"
+    [ "$(grep -c 'ray [0-4]: z = ' log)" = 5 ] && [ "$(grep -cE ': z = [+-][0-9]' log)" -ge 3 ] ||
+        fail "z of five rays, of which the first may miss: $(cat log)"
+    awk '/: z = / && ($5 + 0 > 4 || $5 + 0 < -4) { exit 1 }' log || fail "tables disagree: $(cat log)"
+    exists demo/demo-output/cloud.png
+    [ "$(find demo -maxdepth 1 | sort | xargs)" = "demo demo/apps demo/build demo/demo-output" ] ||
+        fail "left behind: $(ls demo)"
 }
 
 case_real_volumes() {

@@ -140,8 +140,8 @@ TEST(Coverage, TheErrorAskedForIsKeptByAsManySamplesAsItNeeds) {
             squares += std::pow(static_cast<double>(e.transmittance[0]) - scene.exact[i], 2);
             variances += error * error;
         }
-        std::printf("error %g: %zu of %zu rays exactly; mean square %.3g, expected %.3g\n", wanted,
-                    exact, scene.rays.size(), squares, variances);
+        std::printf("error %g: %zu of %zu rays exactly; squared deviations %.3g, expected %.3g\n",
+                    wanted, exact, scene.rays.size(), squares, variances);
         if (wanted > 0.05) {
             EXPECT_LT(exact, scene.rays.size() / 2);
             EXPECT_NEAR(squares / variances, 1, fixtures::kSanitized ? 0.5 : 0.15);

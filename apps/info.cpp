@@ -83,31 +83,25 @@ Json describeGrid(trk::VdbFile& file, const trk::VdbEntry& entry, bool values) {
     json["type"] = entry.type;
     json["stored_as_half"] = entry.half;
     json["compression"] = entry.compressionName();
-    const openvdb::GridBase::Ptr grid = file.readMetadata(entry);
-    if (!grid) {
-        json["can_be_baked"] = false;
-        json["reason"] = "unknown type";
-        return json;
-    }
-    json["class"] = openvdb::GridBase::gridClassToString(grid->getGridClass());
-    const openvdb::Vec3d size = grid->voxelSize();
+    const trk::VdbGridHeader grid = file.readHeader(entry);
+    json["class"] = grid.gridClass();
+    const openvdb::Vec3d size = grid.transform->voxelSize();
     json["voxel_size"] = {size.x(), size.y(), size.z()};
     // Metadata may lie: these are what the file claims.
-    const auto lo = grid->getMetadata<openvdb::Vec3IMetadata>("file_bbox_min");
-    const auto hi = grid->getMetadata<openvdb::Vec3IMetadata>("file_bbox_max");
-    const auto count = grid->getMetadata<openvdb::Int64Metadata>("file_voxel_count");
+    const auto lo = grid.metadata.vec3i("file_bbox_min");
+    const auto hi = grid.metadata.vec3i("file_bbox_max");
+    const auto count = grid.metadata.int64("file_voxel_count");
     if (lo && hi) {
-        json["claimed_index_box"] = {lo->value().x(), lo->value().y(), lo->value().z(),
-                                     hi->value().x(), hi->value().y(), hi->value().z()};
+        json["claimed_index_box"] = {(*lo)[0], (*lo)[1], (*lo)[2], (*hi)[0], (*hi)[1], (*hi)[2]};
     }
     if (count) {
-        json["claimed_active_voxels"] = count->value();
+        json["claimed_active_voxels"] = *count;
     }
     const std::string where = file.path() + ": grid " + entry.label();
     json["can_be_baked"] = nullptr;  // unless its voxels are looked at
     try {
-        json["index_to_world"] = mapOf(trk::affineMap(grid->constTransform(), where));
-        trk::checkKind(entry.type, grid.get(), where);
+        json["index_to_world"] = mapOf(trk::affineMap(*grid.transform, where));
+        trk::checkKind(entry.type, grid.gridClass(), where);
     } catch (const trk::Error& e) {
         json["can_be_baked"] = false;
         json["reason"] = std::string(e.what()).substr(where.size() + 2);

@@ -118,6 +118,7 @@ class Baker {
         };
         std::unordered_map<Entry, Entry> constants;
         plan_.fill(
+            {&field_.table()},
             [&](const Int3& origin, int shift) -> std::optional<Entry> {
                 const auto entry = field_.table().uniformEntry(origin, shift);
                 if (!entry || !ExtinctionField::isConstant(*entry)) {
@@ -293,6 +294,7 @@ class Baker {
         };
         baked_.table = SparseTable(shift_, field_.box());
         baked_.table.fill(
+            {&plan_},
             [&](const Int3& origin, int shift) -> std::optional<Entry> {
                 const auto entry = plan_.uniformEntry(origin, shift);
                 if (!entry) {

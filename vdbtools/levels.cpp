@@ -42,6 +42,7 @@ ValueTable nextLevel(const SparseTable& finer, const trk::IntBox& box, size_t ch
         return it->second;
     };
     level.table.fill(
+        {&finer},
         [&](const Int3& origin, int regionShift) -> std::optional<SparseTable::Entry> {
             const auto entry = finer.uniformEntry(origin, regionShift);
             if (!entry) {
@@ -99,6 +100,7 @@ ValueTable meansOf(const ExtinctionField& field, int shift) {
     std::map<SparseTable::Entry, SparseTable::Entry> constants;
     float vertices[ExtinctionField::kBrickVertices];
     means.table.fill(
+        {&field.table()},
         [&](const Int3& origin, int regionShift) -> std::optional<SparseTable::Entry> {
             const auto entry = field.table().uniformEntry(origin, regionShift);
             if (!entry || !ExtinctionField::isConstant(*entry)) {

@@ -241,6 +241,7 @@ void LitPreview::tabulateLight() {
     };
     table_ = SparseTable(ExtinctionField::kBrickShift, field.box());
     table_.fill(
+        {&field.table()},
         [&](const Int3& origin, int shift) -> std::optional<SparseTable::Entry> {
             const auto found = field.table().find(origin[0], origin[1], origin[2]);
             if (found.shift < shift || !ExtinctionField::isConstant(found.entry)) {

@@ -2,16 +2,19 @@
 #include "verify.h"
 
 #include "io/density_types.h"
-#include "io/tree_regions.h"
 #include "io/vdb_file.h"
+#include "io/vdb_tree.h"
 #include "parallel.h"
 
 #include <algorithm>
 #include <array>
 #include <atomic>
 #include <cmath>
+#include <map>
 #include <optional>
+#include <set>
 #include <sstream>
+#include <utility>
 #include <vector>
 
 namespace vdbtools {
@@ -26,15 +29,141 @@ std::ostream& operator<<(std::ostream& out, const Int3& p) {
     return out << "(" << p[0] << ", " << p[1] << ", " << p[2] << ")";
 }
 
+/// The voxels of a source, repaired, as they are looked up to be compared. In index space, but for
+/// its table, which is in local space. Immutable once made.
+template <class Value>
+class Voxels {
+  public:
+    using Sample = trk::Sample<Value>;
+    static constexpr int kLeafShift = 3;
+
+    Voxels(trk::RegionSource<Value>& source, const Int3& anchor) : anchor_(anchor) {
+        leaves_.resize(source.leafCount() * kLeafVoxels);
+        source.forEachBatch([&](const trk::LeafBatch<Value>& batch) {
+            std::transform(batch.leaf(0), batch.leaf(batch.count),
+                           leaves_.begin() + static_cast<std::ptrdiff_t>(batch.first * kLeafVoxels),
+                           [](const Value& v) { return trk::fieldValue(v); });
+        });
+        IntBox box;
+        const auto add = [&](const std::array<int32_t, 3>& origin, int shift) {
+            const Int3 lo{{origin[0] - anchor[0], origin[1] - anchor[1], origin[2] - anchor[2]}};
+            const int64_t edge = int64_t{1} << shift;
+            blocks_.push_back({lo, {{lo[0] + edge, lo[1] + edge, lo[2] + edge}}});
+            box.add(blocks_.back().lo, blocks_.back().hi);
+        };
+        // What is 0 everywhere may lie where there is no local space.
+        std::vector<SparseTable::Place> places;
+        for (size_t i = 0; i < source.leafCount(); ++i) {
+            const auto first = leaves_.begin() + static_cast<std::ptrdiff_t>(i * kLeafVoxels);
+            if (std::any_of(first, first + kLeafVoxels,
+                            [](const Sample& v) { return v != Sample{}; })) {
+                add(source.leafOrigins()[i], kLeafShift);
+                places.push_back(
+                    {blocks_.back().lo, kLeafShift, static_cast<SparseTable::Entry>(i + 1)});
+            }
+        }
+        std::vector<std::pair<IntBox, SparseTable::Entry>> tiles;
+        for (const trk::Tile<Value>& tile : source.tiles()) {
+            const Sample value = trk::fieldValue(tile.value);
+            if (value != Sample{}) {
+                add(tile.origin, tile.shift);
+                tiles.emplace_back(blocks_.back(), constantEntry(value));
+            }
+        }
+        table_ = SparseTable(kLeafShift, box);
+        for (const auto& [tileBox, entry] : tiles) {
+            table_.addBox(tileBox, entry, places);
+        }
+        table_.assemble(std::move(places));
+    }
+
+    Sample at(const Int3& p) const {
+        const Int3 local{{p[0] - anchor_[0], p[1] - anchor_[1], p[2] - anchor_[2]}};
+        return value(table_.find(local[0], local[1], local[2]).entry, local);
+    }
+    /// Whether a region is of one value, by its leaves and tiles; a leaf counts as several.
+    bool isUniform(const Int3& origin, int shift) const {
+        const auto entry = table_.uniformEntry(
+            {{origin[0] - anchor_[0], origin[1] - anchor_[1], origin[2] - anchor_[2]}}, shift);
+        return entry && isConstant(*entry);
+    }
+    /// Leaves and tiles that are not all 0.
+    std::vector<IntBox> blocks() const {
+        std::vector<IntBox> index = blocks_;
+        for (IntBox& block : index) {
+            for (size_t a = 0; a < 3; ++a) {
+                block.lo[a] += anchor_[a];
+                block.hi[a] += anchor_[a];
+            }
+        }
+        return index;
+    }
+    /// Appends what the voxels of a closed box of `edge` cells follow from; false where leaves have
+    /// a part in it.
+    bool appendKey(const Int3& origin, int64_t edge, SparseTable::Key& key) const {
+        Int3 lo;
+        for (size_t a = 0; a < 3; ++a) {
+            lo[a] = origin[a] - anchor_[a];
+            key.push_back(static_cast<SparseTable::Entry>(lo[a] & 7));
+        }
+        Int3 p;
+        for (p[0] = lo[0] & ~int64_t{7}; p[0] <= lo[0] + edge; p[0] += 8) {
+            for (p[1] = lo[1] & ~int64_t{7}; p[1] <= lo[1] + edge; p[1] += 8) {
+                for (p[2] = lo[2] & ~int64_t{7}; p[2] <= lo[2] + edge; p[2] += 8) {
+                    const auto entry = table_.find(p[0], p[1], p[2]).entry;
+                    if (!isConstant(entry)) {
+                        return false;
+                    }
+                    key.push_back(entry);
+                }
+            }
+        }
+        return true;
+    }
+
+  private:
+    static constexpr size_t kLeafVoxels = trk::LeafBatch<Value>::kLeafVoxels;
+    static constexpr SparseTable::Entry kConstantFlag = 0x40000000u;
+
+    static bool isConstant(SparseTable::Entry entry) {
+        return entry == SparseTable::kEmpty || (entry & kConstantFlag) != 0;
+    }
+    SparseTable::Entry constantEntry(const Sample& value) {
+        const auto [it, isNew] = known_.try_emplace(
+            value, static_cast<SparseTable::Entry>(constants_.size()) | kConstantFlag);
+        if (isNew) {
+            constants_.push_back(value);
+        }
+        return it->second;
+    }
+    Sample value(SparseTable::Entry entry, const Int3& local) const {
+        if (entry == SparseTable::kEmpty) {
+            return {};
+        }
+        return isConstant(entry)
+                   ? constants_[entry & ~kConstantFlag]
+                   : leaves_[(entry - 1) * kLeafVoxels + static_cast<size_t>((local[0] & 7) << 6 |
+                                                                             (local[1] & 7) << 3 |
+                                                                             (local[2] & 7))];
+    }
+
+    Int3 anchor_;
+    SparseTable table_;
+    std::vector<IntBox> blocks_;  // local
+    std::vector<Sample> constants_;
+    std::map<Sample, SparseTable::Entry> known_;
+    std::vector<Sample> leaves_;
+};
+
 /// Everything in index space here; `table` alone is in local space.
-template <class TreeType>
+template <class Value>
 class Verifier {
   public:
-    using Regions = trk::TreeRegions<TreeType>;
-    using Sample = trk::Sample<typename TreeType::ValueType>;
+    using Regions = Voxels<Value>;
+    using Sample = trk::Sample<Value>;
 
-    Verifier(const TreeType& tree, const trk::Sidecar& sidecar)
-        : tree_(tree), sidecar_(sidecar), size_(sidecar.baked.superVoxelSize()) {}
+    Verifier(const Regions& regions, const trk::Sidecar& sidecar)
+        : regions_(regions), sidecar_(sidecar), size_(sidecar.baked.superVoxelSize()) {}
 
     VerifyReport run() {
         VerifyReport report;
@@ -44,27 +173,24 @@ class Verifier {
         });
         report.superVoxels = sidecar_.baked.table.occupiedItems();
         std::atomic<uint64_t> vertices{0};
-        const size_t badPlace = firstFailure(places.size(), [&](Regions& regions, size_t i) {
+        known_.clear();
+        const size_t badPlace = firstFailure(places.size(), [&](size_t i) {
             uint64_t count = 0;
-            const std::string wrong = checkPlace(regions, places[i], count);
+            const std::string wrong = checkPlace(places[i], count);
             vertices += count;
             return !wrong.empty();
         });
         report.vertices = vertices;
         if (badPlace < places.size()) {
-            Regions regions(tree_);
             uint64_t count = 0;
-            report.counterexample = checkPlace(regions, places[badPlace], count);
+            report.counterexample = checkPlace(places[badPlace], count);
             return report;
         }
-        std::vector<IntBox> blocks;  // of voxels that are not all 0
-        collectBlocks(blocks);
-        const size_t badBlock = firstFailure(blocks.size(), [&](Regions& regions, size_t i) {
-            return !checkCoverage(regions, blocks[i]).empty();
-        });
+        const std::vector<IntBox> blocks = regions_.blocks();
+        const size_t badBlock = firstFailure(
+            blocks.size(), [&](size_t i) { return !checkCoverage(blocks[i]).empty(); });
         if (badBlock < blocks.size()) {
-            Regions regions(tree_);
-            report.counterexample = checkCoverage(regions, blocks[badBlock]);
+            report.counterexample = checkCoverage(blocks[badBlock]);
             return report;
         }
         report.holds = true;
@@ -80,9 +206,17 @@ class Verifier {
 
     static constexpr size_t kChannels = std::tuple_size_v<Sample>;
 
-    /// A region of equal super-voxels is one place if they claim to be constant, else one each.
-    void addPlaces(const Int3& origin, int shift, size_t item, std::vector<Place>& places) const {
-        if (sidecar_.baked.isHomogeneous(item) || shift == sidecar_.baked.superVoxelShift) {
+    /// A region of equal super-voxels is one place if they claim to be constant, else one each; of
+    /// those that look alike and claim the same, on the surface of a tile, the first.
+    void addPlaces(const Int3& origin, int shift, size_t item, std::vector<Place>& places) {
+        if (shift == sidecar_.baked.superVoxelShift) {
+            SparseTable::Key key{static_cast<SparseTable::Entry>(item)};
+            if (!regions_.appendKey(origin, size_, key) || known_.insert(std::move(key)).second) {
+                places.push_back({origin, shift, item});
+            }
+            return;
+        }
+        if (sidecar_.baked.isHomogeneous(item)) {
             places.push_back({origin, shift, item});
             return;
         }
@@ -96,14 +230,13 @@ class Verifier {
                  local[2] + sidecar_.anchor[2]}};
     }
 
-    /// Lowest i in [0, count) for which `fails(regions, i)`, or count.
+    /// Lowest i in [0, count) for which `fails(i)`, or count.
     template <class Fails>
     size_t firstFailure(size_t count, const Fails& fails) const {
         std::atomic<size_t> first{count};
         trk::parallelRanges(count, 16, [&](size_t begin, size_t end) {
-            Regions regions(tree_);
             for (size_t i = begin; i != end; ++i) {
-                if (i < first && fails(regions, i)) {
+                if (i < first && fails(i)) {
                     size_t known = first;
                     while (i < known && !first.compare_exchange_weak(known, i)) {
                     }
@@ -113,15 +246,10 @@ class Verifier {
         return first;
     }
 
-    /// Repaired, where the sidecar says so.
-    static Sample vertex(Regions& regions, const Int3& at) {
-        return trk::fieldValue(regions.value(at));
-    }
-
-    std::string checkPlace(Regions& regions, const Place& place, uint64_t& vertices) const {
+    std::string checkPlace(const Place& place, uint64_t& vertices) const {
         const int64_t edge = int64_t{1} << place.shift;
         if (edge > size_) {
-            return checkUniform(regions, place, vertices);
+            return checkUniform(place, vertices);
         }
         const auto controls = controlsOf(place);
         double sum[kChannels] = {};
@@ -133,7 +261,7 @@ class Verifier {
             for (int64_t y = 0; y <= edge; ++y) {
                 for (int64_t z = 0; z <= edge; ++z) {
                     const Int3 at{{place.origin[0] + x, place.origin[1] + y, place.origin[2] + z}};
-                    const Sample sample = vertex(regions, at);
+                    const Sample sample = regions_.at(at);
                     ++vertices;
                     const double w = weight(x) * weight(y) * weight(z);
                     for (size_t c = 0; c < kChannels; ++c) {
@@ -224,7 +352,7 @@ class Verifier {
     }
 
     /// A place larger than a super-voxel claims one value everywhere, faces included.
-    std::string checkUniform(Regions& regions, const Place& place, uint64_t& vertices) const {
+    std::string checkUniform(const Place& place, uint64_t& vertices) const {
         const int64_t edge = int64_t{1} << place.shift;
         const auto controls = controlsOf(place);
         std::string wrong;
@@ -236,15 +364,14 @@ class Verifier {
             const Int3 origin{{place.origin[0] + (corner & 4 ? edge : 0),
                                place.origin[1] + (corner & 2 ? edge : 0),
                                place.origin[2] + (corner & 1 ? edge : 0)}};
-            forEachRegion(regions, origin, place.shift, closed,
-                          [&](const Int3& at, const Sample& sample) {
-                              ++vertices;
-                              for (size_t c = 0; c < kChannels && wrong.empty(); ++c) {
-                                  // Homogeneous: its control is its centre's everywhere.
-                                  wrong = checkVertex(place, c, at, sample[c], controls[c].centre);
-                              }
-                              return wrong.empty();
-                          });
+            forEachRegion(origin, place.shift, closed, [&](const Int3& at, const Sample& sample) {
+                ++vertices;
+                for (size_t c = 0; c < kChannels && wrong.empty(); ++c) {
+                    // Homogeneous: its control is its centre's everywhere.
+                    wrong = checkVertex(place, c, at, sample[c], controls[c].centre);
+                }
+                return wrong.empty();
+            });
         }
         return wrong;
     }
@@ -252,8 +379,7 @@ class Verifier {
     /// Calls `f(at, value)` for every uniform region, or else voxel, of the aligned region of
     /// 2^shift voxels at `origin` that meets `box`, until it answers false.
     template <class F>
-    bool forEachRegion(Regions& regions, const Int3& origin, int shift, const IntBox& box,
-                       const F& f) const {
+    bool forEachRegion(const Int3& origin, int shift, const IntBox& box, const F& f) const {
         const int64_t edge = int64_t{1} << shift;
         for (size_t a = 0; a < 3; ++a) {
             if (origin[a] >= box.hi[a] || origin[a] + edge <= box.lo[a]) {
@@ -261,18 +387,18 @@ class Verifier {
             }
         }
         if (shift == 0) {
-            return f(origin, vertex(regions, origin));
+            return f(origin, regions_.at(origin));
         }
         if (shift >= 3) {
-            if (regions.uniform(origin, shift)) {
-                return f(origin, vertex(regions, origin));
+            if (regions_.isUniform(origin, shift)) {
+                return f(origin, regions_.at(origin));
             }
         }
         for (int64_t octant = 0; octant < 8; ++octant) {
             const int64_t half = edge / 2;
             const Int3 part{{origin[0] + (octant >> 2) * half, origin[1] + (octant >> 1 & 1) * half,
                              origin[2] + (octant & 1) * half}};
-            if (!forEachRegion(regions, part, shift - 1, box, f)) {
+            if (!forEachRegion(part, shift - 1, box, f)) {
                 return false;
             }
         }
@@ -318,31 +444,12 @@ class Verifier {
         return line.str();
     }
 
-    void collectBlocks(std::vector<IntBox>& blocks) const {
-        const auto add = [&](const openvdb::Coord& at, int64_t edge) {
-            const Int3 lo = trk::toInt3(at);
-            blocks.push_back({lo, {{lo[0] + edge, lo[1] + edge, lo[2] + edge}}});
-        };
-        for (auto leaf = tree_.cbeginLeaf(); leaf; ++leaf) {
-            add(leaf->origin(), 8);
-        }
-        auto tile = tree_.cbeginValueAll();
-        tile.setMaxDepth(TreeType::ValueAllCIter::LEAF_DEPTH - 1);
-        for (; tile; ++tile) {
-            if (!(tile.getValue() == openvdb::zeroVal<typename TreeType::ValueType>())) {
-                openvdb::CoordBBox box;
-                tile.getBoundingBox(box);
-                add(box.min(), box.dim().x());
-            }
-        }
-    }
-
     static float largest(const Sample& sample) {
         return *std::max_element(sample.begin(), sample.end());
     }
 
     /// Every super-voxel that a voxel above 0 belongs to must be occupied.
-    std::string checkCoverage(Regions& regions, const IntBox& block) const {
+    std::string checkCoverage(const IntBox& block) const {
         const int64_t edge = block.hi[0] - block.lo[0];
         std::ostringstream line;
         const auto report = [&](const Int3& superVoxel, const Int3& at, float v) {
@@ -350,7 +457,7 @@ class Verifier {
                  << " is " << v;
         };
         if (edge > 8) {  // a tile
-            const float v = largest(vertex(regions, block.lo));
+            const float v = largest(regions_.at(block.lo));
             IntBox touched;
             for (size_t a = 0; a < 3; ++a) {
                 touched.lo[a] = (block.lo[a] - 1 - sidecar_.anchor[a]) & ~(size_ - 1);
@@ -366,7 +473,7 @@ class Verifier {
         for (int64_t i = 0; i < 512; ++i) {
             const Int3 at{
                 {block.lo[0] + (i >> 6), block.lo[1] + (i >> 3 & 7), block.lo[2] + (i & 7)}};
-            const float v = largest(vertex(regions, at));
+            const float v = largest(regions_.at(at));
             for (int corner = 0; v > 0 && corner < 8; ++corner) {
                 Int3 cell = at;
                 for (size_t a = 0; a < 3; ++a) {
@@ -402,9 +509,10 @@ class Verifier {
         return std::nullopt;
     }
 
-    const TreeType& tree_;
+    const Regions& regions_;
     const trk::Sidecar& sidecar_;
     int64_t size_;
+    std::set<SparseTable::Key> known_;  // places that others look like, while they are listed
 };
 
 }  // namespace
@@ -413,10 +521,13 @@ VerifyReport verify(const trk::DensitySummary& density, const trk::Sidecar& side
     trk::VdbFile file(density.path);
     const trk::VdbEntry& entry =
         file.select(density.grid.name + "[" + std::to_string(density.grid.index) + "]");
-    const openvdb::GridBase::Ptr grid = file.read(entry);
     VerifyReport report;
-    grid->apply<trk::DensityGrids>(
-        [&](const auto& typed) { report = Verifier(typed.constTree(), sidecar).run(); });
+    trk::withValueType(density.valueType, [&](auto zero) {
+        using Value = decltype(zero);
+        trk::VdbTree<Value> tree(file, entry, 0);
+        const Voxels<Value> voxels(tree, density.anchor);
+        report = Verifier<Value>(voxels, sidecar).run();
+    });
     return report;
 }
 

@@ -6,7 +6,7 @@
 namespace trk {
 
 ExtinctionField::ExtinctionField(size_t channels, SparseTable table, std::vector<float> constants,
-                                 std::vector<float> floats, std::vector<uint16_t> halfs)
+                                 RawArray<float> floats, RawArray<uint16_t> halfs)
     : channels_(channels),
       table_(std::move(table)),
       constants_(std::move(constants)),
@@ -15,8 +15,8 @@ ExtinctionField::ExtinctionField(size_t channels, SparseTable table, std::vector
       box_(table_.occupiedBox()) {}
 
 size_t ExtinctionField::bytes() const {
-    return table_.bytes() + constants_.capacity() * sizeof(float) +
-           floats_.capacity() * sizeof(float) + halfs_.capacity() * sizeof(uint16_t);
+    return table_.bytes() + constants_.capacity() * sizeof(float) + floats_.bytes() +
+           halfs_.bytes();
 }
 
 template <size_t C>

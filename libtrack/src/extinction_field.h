@@ -3,6 +3,7 @@
 // that keeps all corners of a trilinear look-up in one brick.
 #pragma once
 
+#include "raw_array.h"
 #include "sparse_table.h"
 
 #include <algorithm>
@@ -72,7 +73,7 @@ class ExtinctionField {
     /// Bricks lie one after another in `floats` or `halfs`, x slowest; the other one is empty.
     /// `constants`: `channels` values each.
     ExtinctionField(size_t channels, SparseTable table, std::vector<float> constants,
-                    std::vector<float> floats, std::vector<uint16_t> halfs);
+                    RawArray<float> floats, RawArray<uint16_t> halfs);
 
     size_t channels() const { return channels_; }
 
@@ -187,8 +188,8 @@ class ExtinctionField {
     size_t channels_ = 1;
     SparseTable table_;
     std::vector<float> constants_;
-    std::vector<float> floats_;
-    std::vector<uint16_t> halfs_;
+    RawArray<float> floats_;
+    RawArray<uint16_t> halfs_;
     IntBox box_;
 };
 

@@ -7,6 +7,7 @@
 #include "hash.h"
 
 #include <array>
+#include <bitset>
 #include <cstdint>
 #include <optional>
 #include <unordered_map>
@@ -29,8 +30,9 @@ struct LocalRay {
 /// the extent asks for. An entry above item level is a tile: it stands for its whole region. What
 /// an entry means beyond "empty" is its owner's; equal entries must mean equal contents. Nodes with
 /// equal children are one node, and one whose children are all one tile or item is that entry:
-/// large tiles have large but very regular surfaces, which thus cost next to nothing. Memory goes
-/// with what is occupied; a step of the walk crosses the largest region found empty.
+/// large tiles have large but very regular surfaces, which thus cost next to nothing. A node with
+/// one child that is not empty is a link, of 8 bytes instead of 2048. Memory goes with what is
+/// occupied; a step of the walk crosses the largest region found empty.
 class SparseTable {
   public:
     using Entry = uint32_t;
@@ -38,6 +40,8 @@ class SparseTable {
 
     static constexpr Entry kEmpty = 0;
     static constexpr Entry kNodeFlag = 0x80000000u;
+    /// On a node that is a link.
+    static constexpr Entry kLinkFlag = 0x40000000u;
     /// On an entry whose contents vary within an item and go by the item's place: 512 of them are a
     /// node, not a tile.
     static constexpr Entry kSingleFlag = 0x20000000u;
@@ -74,6 +78,43 @@ class SparseTable {
         root_.assign(static_cast<size_t>(rootSize_[0] * rootSize_[1] * rootSize_[2]), kEmpty);
     }
 
+    /// A region of 2^shift voxels, aligned to its size, and what stands for it.
+    struct Place {
+        Int3 lo;
+        int shift;
+        Entry entry;
+    };
+
+    /// Fills the table with these disjoint places, in any order: items, tiles as addBox makes them,
+    /// nodes as addNode does. Time and memory go with their number.
+    void assemble(std::vector<Place> places) {
+        std::vector<size_t> first(root_.size() + 1);
+        for (const Place& place : places) {
+            ++first[rootIndex(place.lo) + 1];
+        }
+        for (size_t i = 1; i < first.size(); ++i) {
+            first[i] += first[i - 1];
+        }
+        std::vector<Place> sorted(places.size());
+        std::vector<size_t> next = first;
+        for (const Place& place : places) {
+            sorted[next[rootIndex(place.lo)]++] = place;
+        }
+        for (size_t i = 0; i < root_.size(); ++i) {
+            root_[i] = assemble(sorted.data() + first[i], first[i + 1] - first[i],
+                                places.data() + first[i], rootShift_);
+        }
+        finish();
+    }
+
+    /// Adds a box of voxels, of whole items, to `places`: as the largest regions that this table
+    /// has entries for.
+    void addBox(const IntBox& box, Entry entry, std::vector<Place>& places) const {
+        forEachRootRegion(box, [&](size_t, const Int3& origin) {
+            addPart(box, origin, rootShift_, entry, places);
+        });
+    }
+
     /// A table with one entry for the one item it has, of 2^itemShift voxels from 0 on.
     static SparseTable uniform(int itemShift, Entry entry) {
         SparseTable table;
@@ -86,29 +127,59 @@ class SparseTable {
     int itemShift() const { return itemShift_; }
     bool empty() const { return root_.empty(); }
     size_t bytes() const {
-        return root_.capacity() * sizeof(Entry) + nodes_.capacity() * sizeof(Node);
+        return root_.capacity() * sizeof(Entry) + nodes_.capacity() * sizeof(Node) +
+               links_.capacity() * sizeof(Link);
     }
 
     /// What the contents of a region follow from; equal keys, equal contents.
     using Key = std::vector<Entry>;
 
-    /// Fills the table top down. `uniform(origin, shift)` answers for the region of 2^shift voxels:
-    /// an entry that stands for all of it, or nothing, whereupon its eight times eight times eight
-    /// parts are asked; `item(origin)` answers where items are not uniform. `keyOf(origin, shift,
-    /// key)` may append what a region's contents follow from and answer true: regions with equal
-    /// keys are built once.
+    /// Tables whose contents another one's follow from.
+    using Sources = std::vector<const SparseTable*>;
+
+    /// Fills the table top down, wherever one of `sources` holds anything (everywhere, if there are
+    /// none). `uniform(origin, shift)` answers for the region of 2^shift voxels: an entry that
+    /// stands for all of it, or nothing, whereupon its eight times eight times eight parts are
+    /// asked; `item(origin)` answers where items are not uniform. `keyOf(origin, shift, key)` may
+    /// append what a region's contents follow from and answer true: regions with equal keys are
+    /// built once.
     template <class Uniform, class Item, class KeyOf>
-    void fill(Uniform&& uniform, Item&& item, KeyOf&& keyOf) {
+    void fill(const Sources& sources, Uniform&& uniform, Item&& item, KeyOf&& keyOf) {
         Memo memo;
         forEachRootRegion([&](size_t i, const Int3& origin) {
-            root_[i] = build(origin, rootShift_, uniform, item, keyOf, memo);
+            root_[i] = build(sources, origin, rootShift_, uniform, item, keyOf, memo);
         });
-        nodes_.shrink_to_fit();
-        known_.clear();
+        finish();
     }
     template <class Uniform, class Item>
-    void fill(Uniform&& uniform, Item&& item) {
-        fill(uniform, item, [](const Int3&, int, Key&) { return false; });
+    void fill(const Sources& sources, Uniform&& uniform, Item&& item) {
+        fill(sources, uniform, item, [](const Int3&, int, Key&) { return false; });
+    }
+
+    /// Entries of a region and of its seven upper neighbours: bit 2 is x, bit 0 z.
+    using Corners = std::array<Entry, 8>;
+
+    /// Fills this table from one over the same items and box, where what a region holds follows
+    /// from what the other holds there and in its upper neighbours. `entryOf(corners, shift)` is
+    /// asked where none of them is a node, and answers the region's entry, or nothing, whereupon
+    /// its parts are asked; of an item it must answer one. Equal corners, equal entries, but for
+    /// items.
+    template <class EntryOf>
+    void fillFrom(const SparseTable& source, EntryOf&& entryOf) {
+        std::unordered_map<Key, Entry, KeyHash> memo;
+        const int64_t size = int64_t{1} << rootShift_;
+        forEachRootRegion([&](size_t i, const Int3& origin) {
+            Corners corners{};
+            for (size_t c = 0; c < 8; ++c) {
+                corners[c] =
+                    source
+                        .find(origin[0] + (c & 4 ? size : 0), origin[1] + (c & 2 ? size : 0),
+                              origin[2] + (c & 1 ? size : 0), rootShift_)
+                        .entry;
+            }
+            root_[i] = derive(source, corners, rootShift_, entryOf, memo);
+        });
+        finish();
     }
 
     /// Appends what this table holds in a region: a key for tables derived from it. False where
@@ -150,17 +221,18 @@ class SparseTable {
         if (same && (node[0] & (kNodeFlag | kSingleFlag)) == 0) {
             return node[0];
         }
-        const uint64_t hash = hashWords(node.data(), node.size() / 2, 0);
-        const auto [begin, end] = known_.equal_range(hash);
-        for (auto it = begin; it != end; ++it) {
-            if (nodes_[it->second & ~kNodeFlag] == node) {
-                return it->second;
+        size_t occupied = 0;
+        size_t last = 0;
+        for (size_t c = 0; c < node.size() && occupied < 2; ++c) {
+            if (node[c] != kEmpty) {
+                ++occupied;
+                last = c;
             }
         }
-        nodes_.push_back(node);
-        const Entry entry = static_cast<Entry>(nodes_.size() - 1) | kNodeFlag;
-        known_.emplace(hash, entry);
-        return entry;
+        if (occupied == 1) {
+            return addLink(last, node[last]);
+        }
+        return addKnown(hashWords(node.data(), node.size() / 2, 0), nodes_, node, kNodeFlag);
     }
 
     /// The same table with every item and tile entry replaced by `map(entry)`, nodes that became
@@ -176,8 +248,7 @@ class SparseTable {
         for (const Entry entry : root_) {
             result.root_.push_back(mapEntry(entry, map, done, result));
         }
-        result.nodes_.shrink_to_fit();
-        result.known_.clear();
+        result.finish();
         return result;
     }
 
@@ -195,7 +266,7 @@ class SparseTable {
         int shift = rootShift_;
         while ((entry & kNodeFlag) && shift > minShift) {
             shift -= 3;
-            entry = nodes_[entry & ~kNodeFlag][childIndex(x >> shift, y >> shift, z >> shift)];
+            entry = child(entry, childIndex(x >> shift, y >> shift, z >> shift));
         }
         return {entry, shift};
     }
@@ -304,6 +375,18 @@ class SparseTable {
         return found.entry;
     }
 
+    /// The parts, eight an axis, of a region of 2^shift voxels at `origin`.
+    using Parts = std::bitset<512>;
+
+    /// Marks the parts of a region, aligned to its size, in which this table holds anything.
+    void markOccupied(const Int3& origin, int shift, Parts& parts) const {
+        const int64_t size = int64_t{1} << shift;
+        const IntBox region{origin, {{origin[0] + size, origin[1] + size, origin[2] + size}}};
+        forEachRootRegion(region, [&](size_t i, const Int3& lo) {
+            markEntry(root_[i], lo, rootShift_, region, shift - 3, parts);
+        });
+    }
+
     static size_t childIndex(int64_t x, int64_t y, int64_t z) {
         return static_cast<size_t>((x & 7) << 6 | (y & 7) << 3 | (z & 7));
     }
@@ -320,6 +403,183 @@ class SparseTable {
         }
     };
     using Memo = std::unordered_map<Key, Entry, KeyHash>;
+
+    /// A node with one child that is not empty.
+    struct Link {
+        uint32_t child;
+        Entry entry;
+
+        bool operator==(const Link& o) const { return child == o.child && entry == o.entry; }
+    };
+    static constexpr Entry kIndexMask = kLinkFlag - 1;
+
+    Entry child(Entry node, size_t i) const {
+        if (node & kLinkFlag) {
+            const Link& link = links_[node & kIndexMask];
+            return link.child == i ? link.entry : kEmpty;
+        }
+        return nodes_[node & kIndexMask][i];
+    }
+
+    /// The entry of an equal one, or of a new one.
+    template <class Item>
+    Entry addKnown(uint64_t hash, std::vector<Item>& items, const Item& item, Entry flags) {
+        const auto [begin, end] = known_.equal_range(hash);
+        for (auto it = begin; it != end; ++it) {
+            if ((it->second & ~kIndexMask) == flags && items[it->second & kIndexMask] == item) {
+                return it->second;
+            }
+        }
+        items.push_back(item);
+        const Entry entry = static_cast<Entry>(items.size() - 1) | flags;
+        known_.emplace(hash, entry);
+        return entry;
+    }
+    Entry addLink(size_t childAt, Entry entry) {
+        const Link link{static_cast<uint32_t>(childAt), entry};
+        uint64_t word;
+        static_assert(sizeof(word) == sizeof(link));
+        std::memcpy(&word, &link, sizeof(word));
+        return addKnown(hashWords(&word, 1, 1), links_, link, kNodeFlag | kLinkFlag);
+    }
+
+    /// Gives back what only filling needs.
+    void finish() {
+        nodes_.shrink_to_fit();
+        links_.shrink_to_fit();
+        known_ = {};
+    }
+
+    size_t rootIndex(const Int3& at) const {
+        size_t index = 0;
+        for (size_t a = 0; a < 3; ++a) {
+            index = index * static_cast<size_t>(rootSize_[a]) +
+                    static_cast<size_t>((at[a] >> rootShift_) - rootLo_[a]);
+        }
+        return index;
+    }
+
+    /// The entry of a region of 2^shift voxels with these `count` places; `scratch` has room for as
+    /// many. Both are left in another order.
+    Entry assemble(Place* places, size_t count, Place* scratch, int shift) {
+        if (count == 0) {
+            return kEmpty;
+        }
+        const auto childOf = [](const Int3& lo, int childShift) {
+            return childIndex(lo[0] >> childShift, lo[1] >> childShift, lo[2] >> childShift);
+        };
+        if (count == 1) {
+            Entry entry = places->entry;
+            for (int s = places->shift; s < shift; s += 3) {
+                entry = addLink(childOf(places->lo, s), entry);
+            }
+            return entry;
+        }
+        std::array<size_t, 513> first{};
+        for (size_t i = 0; i < count; ++i) {
+            ++first[childOf(places[i].lo, shift - 3) + 1];
+        }
+        for (size_t c = 1; c < first.size(); ++c) {
+            first[c] += first[c - 1];
+        }
+        std::array<size_t, 513> next = first;
+        for (size_t i = 0; i < count; ++i) {
+            scratch[next[childOf(places[i].lo, shift - 3)]++] = places[i];
+        }
+        Node node;
+        for (size_t c = 0; c < node.size(); ++c) {
+            node[c] =
+                assemble(scratch + first[c], first[c + 1] - first[c], places + first[c], shift - 3);
+        }
+        return addNode(node);
+    }
+
+    /// The part of a box in the region of 2^shift voxels at `origin`, which meets it.
+    void addPart(const IntBox& box, const Int3& origin, int shift, Entry entry,
+                 std::vector<Place>& places) const {
+        const int64_t size = int64_t{1} << shift;
+        bool inside = true;
+        for (size_t a = 0; a < 3; ++a) {
+            inside = inside && box.lo[a] <= origin[a] && box.hi[a] >= origin[a] + size;
+        }
+        if (inside) {
+            places.push_back({origin, shift, entry});
+            return;
+        }
+        forEachChild(box, origin, shift,
+                     [&](size_t, const Int3& lo) { addPart(box, lo, shift - 3, entry, places); });
+    }
+
+    /// Calls f(index, origin) for the children, of a node of 2^shift voxels at `origin`, that meet
+    /// a box.
+    template <class F>
+    static void forEachChild(const IntBox& box, const Int3& origin, int shift, const F& f) {
+        const int childShift = shift - 3;
+        size_t lo[3];
+        size_t hi[3];
+        for (size_t a = 0; a < 3; ++a) {
+            const int64_t size = int64_t{1} << shift;
+            lo[a] = static_cast<size_t>(std::max<int64_t>(box.lo[a] - origin[a], 0) >> childShift);
+            hi[a] = static_cast<size_t>(
+                (std::min(box.hi[a] - origin[a], size) + (int64_t{1} << childShift) - 1) >>
+                childShift);
+        }
+        for (size_t x = lo[0]; x < hi[0]; ++x) {
+            for (size_t y = lo[1]; y < hi[1]; ++y) {
+                for (size_t z = lo[2]; z < hi[2]; ++z) {
+                    const size_t c = x << 6 | y << 3 | z;
+                    f(c, childOrigin(origin, childShift, c));
+                }
+            }
+        }
+    }
+
+    /// Marks the parts of 2^partShift voxels, of a region, that an entry of 2^shift voxels at `lo`
+    /// occupies.
+    static void markPart(const Int3& lo, const IntBox& region, int partShift, Parts& parts) {
+        parts.set(childIndex((lo[0] - region.lo[0]) >> partShift,
+                             (lo[1] - region.lo[1]) >> partShift,
+                             (lo[2] - region.lo[2]) >> partShift));
+    }
+    void markEntry(Entry entry, const Int3& lo, int shift, const IntBox& region, int partShift,
+                   Parts& parts) const {
+        if (entry == kEmpty) {
+            return;
+        }
+        if (shift <= partShift) {
+            markPart(lo, region, partShift, parts);
+            return;
+        }
+        if ((entry & kNodeFlag) == 0) {  // a tile: what it shares with the region
+            IntBox box = region;
+            for (size_t a = 0; a < 3; ++a) {
+                box.lo[a] = std::max(box.lo[a], lo[a]);
+                box.hi[a] = std::min(box.hi[a], lo[a] + (int64_t{1} << shift));
+            }
+            forEachChild(box, region.lo, partShift + 3,
+                         [&](size_t c, const Int3&) { parts.set(c); });
+            return;
+        }
+        if (entry & kLinkFlag) {
+            const Link& link = links_[entry & kIndexMask];
+            const Int3 at = childOrigin(lo, shift - 3, link.child);
+            bool meets = true;
+            for (size_t a = 0; a < 3; ++a) {
+                meets = meets && at[a] < region.hi[a] &&
+                        at[a] + (int64_t{1} << (shift - 3)) > region.lo[a];
+            }
+            if (meets) {
+                markEntry(link.entry, at, shift - 3, region, partShift, parts);
+            }
+            return;
+        }
+        const Node& node = nodes_[entry & kIndexMask];
+        forEachChild(region, lo, shift, [&](size_t c, const Int3& at) {
+            if (node[c] != kEmpty) {
+                markEntry(node[c], at, shift - 3, region, partShift, parts);
+            }
+        });
+    }
 
     static int64_t clampCell(double x, int64_t lo, int64_t hi) {
         // Points here are never negative but for rounding, so truncation is as good as floor.
@@ -339,9 +599,30 @@ class SparseTable {
         }
     }
 
+    /// The same for the root's regions that meet a box.
+    template <class F>
+    void forEachRootRegion(const IntBox& box, F&& f) const {
+        Int3 lo;
+        Int3 hi;
+        for (size_t a = 0; a < 3; ++a) {
+            lo[a] = std::max(box.lo[a] >> rootShift_, rootLo_[a]);
+            hi[a] = std::min(((box.hi[a] - 1) >> rootShift_) + 1, rootLo_[a] + rootSize_[a]);
+        }
+        Int3 at;
+        for (at[0] = lo[0]; at[0] < hi[0]; ++at[0]) {
+            for (at[1] = lo[1]; at[1] < hi[1]; ++at[1]) {
+                for (at[2] = lo[2]; at[2] < hi[2]; ++at[2]) {
+                    const Int3 origin{
+                        {at[0] << rootShift_, at[1] << rootShift_, at[2] << rootShift_}};
+                    f(rootIndex(origin), origin);
+                }
+            }
+        }
+    }
+
     template <class Uniform, class Item, class KeyOf>
-    Entry build(const Int3& origin, int shift, Uniform& uniform, Item& item, KeyOf& keyOf,
-                Memo& memo) {
+    Entry build(const Sources& sources, const Int3& origin, int shift, Uniform& uniform, Item& item,
+                KeyOf& keyOf, Memo& memo) {
         if (const std::optional<Entry> entry = uniform(origin, shift)) {
             return *entry;
         }
@@ -357,16 +638,67 @@ class SparseTable {
         if (shift == itemShift_) {
             entry = item(origin);
         } else {
+            Parts parts;
+            for (const SparseTable* source : sources) {
+                source->markOccupied(origin, shift, parts);
+            }
             Node node;
             for (size_t c = 0; c < node.size(); ++c) {
-                node[c] =
-                    build(childOrigin(origin, shift - 3, c), shift - 3, uniform, item, keyOf, memo);
+                node[c] = sources.empty() || parts[c]
+                              ? build(sources, childOrigin(origin, shift - 3, c), shift - 3,
+                                      uniform, item, keyOf, memo)
+                              : kEmpty;
             }
             entry = addNode(node);
         }
         if (known) {
             memo.emplace(std::move(key), entry);
         }
+        return entry;
+    }
+
+    template <class EntryOf>
+    Entry derive(const SparseTable& source, const Corners& corners, int shift, EntryOf& entryOf,
+                 std::unordered_map<Key, Entry, KeyHash>& memo) {
+        Entry all = kEmpty;
+        for (const Entry e : corners) {
+            all |= e;
+        }
+        if (all == kEmpty) {
+            return kEmpty;
+        }
+        if ((all & kNodeFlag) == 0) {
+            if (const std::optional<Entry> entry = entryOf(corners, shift)) {
+                return *entry;
+            }
+        }
+        Key key(corners.begin(), corners.end());
+        key.push_back(static_cast<Entry>(shift));
+        if (const auto it = memo.find(key); it != memo.end()) {
+            return it->second;
+        }
+        // The parts' entries, nine an axis: the last of each is the upper neighbour's.
+        std::array<Entry, 729> parts;
+        for (size_t c = 0; c < 8; ++c) {
+            const size_t first = (c & 4 ? 8 * 81 : 0) + (c & 2 ? 8 * 9 : 0) + (c & 1 ? 8 : 0);
+            for (size_t x = 0; x < (c & 4 ? 1u : 8u); ++x) {
+                for (size_t y = 0; y < (c & 2 ? 1u : 8u); ++y) {
+                    for (size_t z = 0; z < (c & 1 ? 1u : 8u); ++z) {
+                        parts[first + x * 81 + y * 9 + z] =
+                            corners[c] & kNodeFlag ? source.child(corners[c], x << 6 | y << 3 | z)
+                                                   : corners[c];
+                    }
+                }
+            }
+        }
+        Node node;
+        for (size_t c = 0; c < node.size(); ++c) {
+            const Entry* at = &parts[(c >> 6) * 81 + (c >> 3 & 7) * 9 + (c & 7)];
+            node[c] = derive(source, {at[0], at[1], at[9], at[10], at[81], at[82], at[90], at[91]},
+                             shift - 3, entryOf, memo);
+        }
+        const Entry entry = addNode(node);
+        memo.emplace(std::move(key), entry);
         return entry;
     }
 
@@ -382,9 +714,14 @@ class SparseTable {
         if (const auto it = done.find(entry); it != done.end()) {
             return it->second;
         }
-        Node node = nodes_[entry & ~kNodeFlag];
-        for (Entry& child : node) {
-            child = mapEntry(child, map, done, result);
+        if (entry & kLinkFlag) {
+            const Link& link = links_[entry & kIndexMask];
+            const Entry mapped = mapEntry(link.entry, map, done, result);
+            return done[entry] = mapped == kEmpty ? kEmpty : result.addLink(link.child, mapped);
+        }
+        Node node = nodes_[entry & kIndexMask];
+        for (Entry& e : node) {
+            e = mapEntry(e, map, done, result);
         }
         return done[entry] = result.addNode(node);
     }
@@ -398,8 +735,13 @@ class SparseTable {
             f(origin, shift, entry);
             return;
         }
+        if (entry & kLinkFlag) {
+            const Link& link = links_[entry & kIndexMask];
+            visitEntry(link.entry, childOrigin(origin, shift - 3, link.child), shift - 3, f);
+            return;
+        }
         for (size_t c = 0; c < 512; ++c) {
-            visitEntry(nodes_[entry & ~kNodeFlag][c], childOrigin(origin, shift - 3, c), shift - 3,
+            visitEntry(nodes_[entry & kIndexMask][c], childOrigin(origin, shift - 3, c), shift - 3,
                        f);
         }
     }
@@ -410,7 +752,8 @@ class SparseTable {
     Int3 rootSize_{{0, 0, 0}};
     std::vector<Entry> root_;
     std::vector<Node> nodes_;
-    std::unordered_multimap<uint64_t, Entry> known_;  // nodes by hash, while filling
+    std::vector<Link> links_;
+    std::unordered_multimap<uint64_t, Entry> known_;  // nodes and links by hash, while filling
 };
 
 }  // namespace trk

@@ -178,7 +178,8 @@ Volume openVolume(const char* vdbPath, const char* sidecarPath, const VolumeOpti
     }
     Volume volume;
     if (vdbPath == nullptr) {
-        sidecar = readSidecar(path, nullptr, options.check);
+        sidecar =
+            readSidecar(path, nullptr, options.check, SidecarParts::kQueries, options.maxMemory);
         volume.grid = sidecar.header.source;
         if (options.gridNamed && options.gridName != volume.grid.name &&
             options.gridName != volume.grid.name + "[" + std::to_string(volume.grid.index) + "]") {
@@ -201,7 +202,8 @@ Volume openVolume(const char* vdbPath, const char* sidecarPath, const VolumeOpti
             makeVolume(density.summary,
                        std::make_shared<const ExtinctionField>(std::move(density.field)), options);
         if (haveSidecar) {
-            sidecar = readSidecar(path, &density.summary, options.check);
+            sidecar = readSidecar(path, &density.summary, options.check, SidecarParts::kQueries,
+                                  options.maxMemory);
         }
     }
     volume.sidecarPath = path;

@@ -393,8 +393,16 @@ TEST(LoadDensity, ReadsFilesOfVersion225) {
                   "version 226, written by OpenVDB 14.");
     std::string half = bytes;
     const std::string name("\x10\0\0\0Tree_float_5_4_3", 20);
-    half.replace(half.find(name), name.size(), std::string("\x0f\0\0\0Tree_half_5_4_3", 19));
-    half += '\0';  // as long as its directory says
+    const std::string halfName("\x0f\0\0\0Tree_half_5_4_3", 19);
+    const size_t at = half.find(name);
+    half.replace(at, name.size(), halfName);
+    for (size_t i = 0; i < 3; ++i) {  // the directory's offsets, behind an empty name of a parent
+        int64_t offset;
+        char* place = &half[at + halfName.size() + 4 + 8 * i];
+        std::memcpy(&offset, place, sizeof(offset));
+        --offset;
+        std::memcpy(place, &offset, sizeof(offset));
+    }
     expectFailure(asVersion(half, 225, 13, "half.vdb"), TRK_ERROR_UNSUPPORTED_GRID,
                   "native halfs, which OpenVDB 13 writes");
 }

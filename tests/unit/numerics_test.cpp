@@ -159,8 +159,9 @@ TEST(SuperVoxels, BoundsCoverTheResidualOfEveryChoice) {
          {TRK_CHOICE_ROBUST, TRK_CHOICE_MEAN, TRK_CHOICE_MIN, TRK_CHOICE_MAX}) {
         trk::BakedVolume baked;
         baked.table = trk::SparseTable(4, {{{0, 0, 0}}, {{16, 16, 16}}});
-        baked.table.fill([](const trk::Int3&, int) { return std::nullopt; },
-                         [](const trk::Int3&) { return 1u; });
+        baked.table.fill(
+            {}, [](const trk::Int3&, int) { return std::nullopt; },
+            [](const trk::Int3&) { return 1u; });
         baked.items.push_back({0.1f, 0.7f, 0.3f, 0.2f, 0.4f, 0.2f});
         const float scale = 3.3f;
         const trk::SuperVoxels opened(std::move(baked), {static_cast<double>(scale)}, choice, 0.05);

@@ -22,13 +22,14 @@ IntBox cube(int64_t size) {
 /// A table of items of 8^3 voxels, occupied by a hash of the position.
 SparseTable randomTable(int64_t size) {
     SparseTable table(3, cube(size));
-    table.fill([](const Int3&, int) { return std::nullopt; },
-               [](const Int3& at) {
-                   const auto hash = static_cast<uint64_t>(at[0] * 73856093 ^ at[1] * 19349663 ^
-                                                           at[2] * 83492791);
-                   return hash % 3 == 0 ? static_cast<SparseTable::Entry>(1 + hash % 1000)
-                                        : SparseTable::kEmpty;
-               });
+    table.fill(
+        {}, [](const Int3&, int) { return std::nullopt; },
+        [](const Int3& at) {
+            const auto hash =
+                static_cast<uint64_t>(at[0] * 73856093 ^ at[1] * 19349663 ^ at[2] * 83492791);
+            return hash % 3 == 0 ? static_cast<SparseTable::Entry>(1 + hash % 1000)
+                                 : SparseTable::kEmpty;
+        });
     return table;
 }
 
@@ -78,8 +79,9 @@ TEST(SparseTable, FindsWhatWasFilled) {
 
 TEST(SparseTable, FullTableCoversTheWholeInterval) {
     SparseTable table(3, cube(256));
-    table.fill([](const Int3&, int) { return std::nullopt; },
-               [](const Int3& at) { return static_cast<SparseTable::Entry>(1 + at[0]); });
+    table.fill(
+        {}, [](const Int3&, int) { return std::nullopt; },
+        [](const Int3& at) { return static_cast<SparseTable::Entry>(1 + at[0]); });
     std::mt19937_64 random(7);
     std::uniform_real_distribution<double> unit(0, 1);
     std::vector<LocalRay> rays;
@@ -146,6 +148,7 @@ TEST(SparseTable, CrossesAHugeGapInAFewSteps) {
     SparseTable table(3, cube(kFar + 8));
     int asked = 0;
     table.fill(
+        {},
         [&](const Int3& at, int shift) -> std::optional<SparseTable::Entry> {
             ++asked;
             const int64_t size = int64_t{1} << shift;

@@ -5,6 +5,7 @@
 #include "density_types.h"
 #include "field_builder.h"
 #include "vdb_file.h"
+#include "vdb_tree.h"
 
 #include <sstream>
 #include <utility>
@@ -14,13 +15,13 @@ namespace trk {
 namespace {
 
 /// Whether a grid may be meant to be a density, by its class.
-bool isCandidate(const VdbEntry& entry, const openvdb::GridBase& grid) {
-    const openvdb::GridClass gridClass = grid.getGridClass();
+bool isCandidate(const VdbEntry& entry, const VdbGridHeader& header) {
+    const std::string gridClass = header.gridClass();
     switch (channelCount(valueTypeName(entry.type))) {
         case 1:
-            return gridClass == openvdb::GRID_FOG_VOLUME || gridClass == openvdb::GRID_UNKNOWN;
+            return gridClass == "fog volume" || gridClass == "unknown";
         case 3:
-            return gridClass == openvdb::GRID_FOG_VOLUME;
+            return gridClass == "fog volume";
         default:
             return false;
     }
@@ -37,8 +38,7 @@ const VdbEntry& choose(VdbFile& file, const DensityOptions& options) {
     std::vector<const VdbEntry*> candidates;
     bool hasDensity = false;
     for (const VdbEntry& entry : file.entries()) {
-        const openvdb::GridBase::Ptr grid = file.readMetadata(entry);
-        if (grid && isCandidate(entry, *grid)) {
+        if (isCandidate(entry, file.readHeader(entry))) {
             candidates.push_back(&entry);
             hasDensity = hasDensity || entry.name == "density";
         }
@@ -53,8 +53,7 @@ const VdbEntry& choose(VdbFile& file, const DensityOptions& options) {
         return file.entries()[0];  // whose refusal says more than a list of one
     }
     for (const VdbEntry& entry : file.entries()) {
-        const openvdb::GridBase::Ptr grid = file.readMetadata(entry);
-        if (grid && (*grid)["track_format"]) {
+        if (file.readHeader(entry).metadata.text("track_format")) {
             throw Error(TRK_ERROR_GRID_NOT_FOUND,
                         file.path() + ": is a sidecar; expected the density it was baked from");
         }
@@ -67,14 +66,16 @@ const VdbEntry& choose(VdbFile& file, const DensityOptions& options) {
 }
 
 template <class Value>
-void checkValues(const TreeScan& scan, const Value& background, uint32_t repair,
-                 const std::string& where) {
+void checkBackground(const Value& background, const std::string& where) {
     if (!(background == openvdb::zeroVal<Value>())) {
         std::ostringstream line;
         line << where << ": background is " << background
              << "; expected 0, or the extinction has no end";
         throw Error(TRK_ERROR_BAD_DENSITY, line.str());
     }
+}
+
+void checkValues(const RegionScan& scan, uint32_t repair, const std::string& where) {
     const auto refuse = [&](const BadValues& bad, const char* kind, const char* repairBit) {
         std::ostringstream line;
         line << where << ": " << bad.count << (bad.count == 1 ? " voxel is " : " voxels are ")
@@ -90,29 +91,32 @@ void checkValues(const TreeScan& scan, const Value& background, uint32_t repair,
     }
 }
 
-template <class GridType>
-Density convert(const GridType& grid, const DensityOptions& options, const std::string& where) {
+template <class Value>
+Density load(VdbFile& file, const VdbEntry& entry, const DensityOptions& options,
+             const std::string& where) {
+    VdbTree<Value> tree(file, entry, options.maxMemory);
+    checkBackground(tree.background(), where);
+    FieldBuilder<Value> builder(tree, options.maxMemory, where);
+    const RegionScan& scan = builder.scan();
+    checkValues(scan, options.repair, where);
     Density density;
     DensitySummary& summary = density.summary;
-    const FieldBuilder<typename GridType::TreeType> builder(grid.constTree());
-    const TreeScan& scan = builder.scan();
-    checkValues(scan, grid.background(), options.repair, where);
     summary.digest = scan.digest;
     summary.activeVoxels = scan.activeVoxels;
-    summary.gridBytes = grid.memUsage();
+    summary.gridBytes = tree.openvdbBytes();
     summary.min = scan.min;
     summary.max = scan.max;
     summary.repair = options.repair;
     summary.dropped = scan.nonfinite.count;
     summary.clamped = scan.negative.count;
     summary.anchor = anchorFor(scan.box);
-    density.field = builder.build(summary.anchor, options.maxMemory, where);
+    density.field = builder.build(summary.anchor);
     return density;
 }
 
 }  // namespace
 
-void checkKind(const std::string& treeType, const openvdb::GridBase* grid,
+void checkKind(const std::string& treeType, const std::string& gridClass,
                const std::string& where) {
     const auto refuse = [&](const std::string& found) {
         throw Error(
@@ -123,18 +127,14 @@ void checkKind(const std::string& treeType, const openvdb::GridBase* grid,
     if (valueType == "half") {
         refuse("of native halfs, which OpenVDB 13 writes (file version 225)");
     }
-    if (!grid || channelCount(valueType) == 0) {
-        refuse("of type " + valueType);
+    if (channelCount(valueType) == 0 || treeType != treeTypeName(valueType)) {
+        refuse("of type " + (channelCount(valueType) == 0 ? valueType : treeType));
     }
-    switch (grid->getGridClass()) {
-        case openvdb::GRID_LEVEL_SET:
-            refuse("a level set");
-            break;
-        case openvdb::GRID_STAGGERED:
-            refuse("staggered");
-            break;
-        default:
-            break;
+    if (gridClass == "level set") {
+        refuse("a level set");
+    }
+    if (gridClass == "staggered") {
+        refuse("staggered");
     }
 }
 
@@ -142,19 +142,18 @@ Density loadDensity(const std::string& path, const DensityOptions& options) {
     VdbFile file(path);
     const VdbEntry& entry = choose(file, options);
     const std::string where = path + ": grid " + entry.label();
-    const openvdb::GridBase::Ptr metadata = file.readMetadata(entry);
-    checkKind(entry.type, metadata.get(), where);
-    const AffineMap map = affineMap(metadata->constTransform(), where);
-
-    openvdb::GridBase::Ptr grid = file.read(entry, options.maxMemory);
-    Density density;
-    grid->apply<DensityGrids>([&](const auto& typed) { density = convert(typed, options, where); });
+    const VdbGridHeader header = file.readHeader(entry);
+    checkKind(entry.type, header.gridClass(), where);
+    const AffineMap map = affineMap(*header.transform, where);
+    const std::string valueType = valueTypeName(entry.type);
+    Density density = withValueType(
+        valueType, [&](auto zero) { return load<decltype(zero)>(file, entry, options, where); });
     density.summary.path = path;
     density.summary.fileBytes = file.bytes();
     density.summary.fileModified = file.modified();
     density.summary.grid = {entry.name, entry.index};
     density.summary.label = entry.label();
-    density.summary.valueType = valueTypeName(entry.type);
+    density.summary.valueType = valueType;
     density.summary.indexToWorld = map;
     return density;
 }

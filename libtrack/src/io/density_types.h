@@ -89,9 +89,21 @@ inline uint64_t valueBytes(const std::string& valueType) {
     return component * static_cast<uint64_t>(channelCount(valueType));
 }
 
-/// Throws UNSUPPORTED_GRID where a grid's type or class, as its header says, cannot be a density's;
-/// NULL for an unknown type. `where` begins the message.
-void checkKind(const std::string& treeType, const openvdb::GridBase* grid,
-               const std::string& where);
+/// Calls f(a zero of the type) for the type of value of that name, a density's, and answers what it
+/// does.
+template <class F>
+auto withValueType(const std::string& valueType, const F& f) {
+    if (valueType == "double") {
+        return f(double{});
+    }
+    if (valueType == "vec3s") {
+        return f(openvdb::Vec3f(0));
+    }
+    return valueType == "vec3d" ? f(openvdb::Vec3d(0)) : f(0.0f);
+}
+
+/// Throws UNSUPPORTED_GRID where a grid's type or class, as its header says, cannot be a density's.
+/// `where` begins the message.
+void checkKind(const std::string& treeType, const std::string& gridClass, const std::string& where);
 
 }  // namespace trk

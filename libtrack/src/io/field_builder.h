@@ -1,6 +1,7 @@
 // SPDX-License-Identifier: Apache-2.0
-// From an OpenVDB tree to bricks: one scan of the leaves (checks, digest, extent), then bricks
-// wherever a vertex is not constant. Work and memory go with the leaves, not with tiles or boxes.
+// From a source of regions to bricks. One pass over the leaves checks them, sums their digest and
+// puts their values into bricks; then the bricks learn their neighbours' edge. Work and memory go
+// with leaves and tiles, not with boxes; beside the field itself only lists are held.
 #pragma once
 
 #include "../extinction_field.h"
@@ -8,14 +9,18 @@
 #include "../hash.h"
 #include "../parallel.h"
 #include "density_types.h"
-#include "tree_regions.h"
+#include "region_source.h"
+
+#include <tbb/spin_mutex.h>
 
 #include <algorithm>
 #include <array>
+#include <atomic>
 #include <cmath>
 #include <limits>
 #include <map>
 #include <string>
+#include <unordered_map>
 #include <vector>
 
 namespace trk {
@@ -32,13 +37,12 @@ struct BadValues {
     }
 };
 
-/// What one pass over a tree's leaves and tiles found.
-struct TreeScan {
+/// What one pass over a source's leaves and tiles found.
+struct RegionScan {
     BadValues negative;
     BadValues nonfinite;
     uint64_t digest = 0;
     uint64_t activeVoxels = 0;
-    bool exactHalfs = true;
     bool any = false;  ///< min and max are of something
     float min = 0;
     float max = 0;
@@ -49,12 +53,11 @@ struct TreeScan {
         max = any ? std::max(max, hi) : hi;
         any = true;
     }
-    void join(const TreeScan& o) {
+    void join(const RegionScan& o) {
         negative.add(o.negative.count, o.negative.first);
         nonfinite.add(o.nonfinite.count, o.nonfinite.first);
         digest += o.digest;
         activeVoxels += o.activeVoxels;
-        exactHalfs = exactHalfs && o.exactHalfs;
         if (o.any) {
             addRange(o.min, o.max);
         }
@@ -64,183 +67,169 @@ struct TreeScan {
     }
 };
 
-template <class TreeType>
+/// Builds a field once: scan(), whose findings the caller judges, then build().
+template <class Value>
 class FieldBuilder {
   public:
-    using Leaf = typename TreeType::LeafNodeType;
-    using Value = typename TreeType::ValueType;
-    using Entry = SparseTable::Entry;
+    /// `maxMemory`: bytes that the field and what building it takes may come to; 0: no limit.
+    FieldBuilder(RegionSource<Value>& source, uint64_t maxMemory, std::string where)
+        : source_(source), maxMemory_(maxMemory), where_(std::move(where)) {}
 
-    explicit FieldBuilder(const TreeType& tree) : tree_(tree) { scanTree(); }
+    /// The pass over the leaves. Throws OUT_OF_MEMORY, and what the source throws.
+    const RegionScan& scan();
 
-    const TreeScan& scan() const { return scan_; }
-
-    /// The field, in space relative to `anchor`; values that are negative or not finite count as 0.
-    /// Throws OUT_OF_MEMORY where the bricks would take more than `maxMemory` bytes (0: no limit).
-    ExtinctionField build(const Int3& anchor, uint64_t maxMemory, const std::string& where) const;
+    /// The field, in space relative to `anchor`, a multiple of every tile's size; values that are
+    /// negative or not finite count as 0.
+    ExtinctionField build(const Int3& anchor);
 
   private:
+    using Entry = SparseTable::Entry;
+    using Origin = typename RegionSource<Value>::Origin;
     static constexpr size_t kBrickVertices = ExtinctionField::kBrickVertices;
+    static constexpr size_t kLeafVoxels = LeafBatch<Value>::kLeafVoxels;
     static constexpr size_t kChannels = ValueTraits<Value>::kChannels;
-    using Regions = TreeRegions<TreeType>;
+    static constexpr size_t kBrickValues = kBrickVertices * kChannels;
+    /// On an entry of the table of the source's regions: a constant. Else a leaf's index, plus one.
+    static constexpr Entry kConstantFlag = ExtinctionField::kConstantFlag;
     using FieldValue = Sample<Value>;
-    using Vertices = std::array<FieldValue, kBrickVertices>;
-    static_assert(sizeof(Vertices) == kBrickVertices * kChannels * sizeof(float));
-    using CornerValues = std::array<FieldValue, 8>;
+    /// Entries of a region and of its seven upper neighbours, or their values.
+    using Corners = std::array<Entry, 8>;
 
-    struct Tile {
-        openvdb::Coord origin;
-        int shift;
-        Value value;
-        bool active;
-    };
-
-    /// A brick to fill: from the tree around `origin` (index space), or, where all eight regions it
-    /// reaches into are tiles, from their values.
-    struct Job {
-        Int3 origin;
-        bool fromTiles;
-        CornerValues values;
-    };
-
-    /// What the recursion of build() works on.
-    struct Plan {
-        SparseTable table;
-        std::vector<Job> jobs;
-        std::vector<float> constants;
-        std::map<FieldValue, Entry> constantEntries;
-        std::map<std::pair<int, CornerValues>, Entry> shared;
-
-        Entry constantEntry(const FieldValue& value) {
-            if (value == FieldValue{}) {
-                return SparseTable::kEmpty;
-            }
-            const size_t next = constants.size() / kChannels;
-            const auto [it, isNew] = constantEntries.try_emplace(
-                value, static_cast<Entry>(next) | ExtinctionField::kConstantFlag);
-            if (isNew) {
-                constants.insert(constants.end(), value.begin(), value.end());
-            }
-            return it->second;
-        }
-        Entry jobEntry(const Job& job) {
-            jobs.push_back(job);
-            return static_cast<Entry>(jobs.size());
-        }
-        /// Entry for a region whose own value and those of its seven upper neighbours are constant.
-        /// Such regions look alike all over the surface of a tile, so they are built once.
-        Entry sharedEntry(int shift, const CornerValues& values) {
-            if (std::all_of(values.begin(), values.end(),
-                            [&](const FieldValue& v) { return v == values[0]; })) {
-                return constantEntry(values[0]);
-            }
-            const auto key = std::make_pair(shift, values);
-            if (const auto it = shared.find(key); it != shared.end()) {
-                return it->second;
-            }
-            Entry entry;
-            if (shift == ExtinctionField::kBrickShift) {
-                entry = jobEntry({Int3{{0, 0, 0}}, true, values});
-            } else {
-                SparseTable::Node node;
-                for (size_t c = 0; c < node.size(); ++c) {
-                    CornerValues child;
-                    for (size_t corner = 0; corner < 8; ++corner) {
-                        // The last child of an axis looks into the upper neighbour.
-                        const size_t x = (c >> 6) + (corner >> 2) > 7 ? 4 : 0;
-                        const size_t y = (c >> 3 & 7) + (corner >> 1 & 1) > 7 ? 2 : 0;
-                        const size_t z = (c & 7) + (corner & 1) > 7 ? 1 : 0;
-                        child[corner] = values[x + y + z];
-                    }
-                    node[c] = sharedEntry(shift - 3, child);
-                }
-                entry = table.addNode(node);
-            }
-            shared.emplace(key, entry);
-            return entry;
+    struct CornersHash {
+        size_t operator()(const std::pair<int, Corners>& key) const {
+            return hashWords(key.second.data(), 4, static_cast<uint64_t>(key.first));
         }
     };
 
-    static void scanValue(const Value& value, const openvdb::Coord& at, uint64_t count,
-                          TreeScan& scan) {
-        const FieldValue floats = toFloats(value);
-        const Int3 where{{at.x(), at.y(), at.z()}};
-        // A double beyond float's range is infinite to the field.
-        if (!std::all_of(floats.begin(), floats.end(), [](float v) { return std::isfinite(v); })) {
-            scan.nonfinite.add(count, where);
-        } else if (std::any_of(floats.begin(), floats.end(), [](float v) { return v < 0; })) {
-            scan.negative.add(count, where);
-        }
-        for (const float f : fieldValue(value)) {
-            scan.addRange(f, f);
-            scan.exactHalfs = scan.exactHalfs && isExactHalf(f);
-        }
+    /// A brick whose values partly come from leaves, or are all given by constants.
+    struct Brick {
+        Corners corners;
+        Entry entry;
+    };
+
+    /// What goes on while storage is of one type.
+    template <class Stored>
+    class Bricks;
+
+    template <class Stored>
+    bool tryScan(RawArray<Stored>& values);
+    static void scanLeaf(const Value* values, const uint64_t* mask, const Origin& origin,
+                         RegionScan& scan, FieldValue* floats);
+    void scanTile(const Tile<Value>& tile, RegionScan& scan);
+    static void scanValue(const Value& value, const Int3& at, uint64_t count, RegionScan& scan);
+    static void addSupport(const Origin& o, int64_t size, RegionScan& scan) {
+        scan.box.add({{int64_t{o[0]} - 1, int64_t{o[1]} - 1, int64_t{o[2]} - 1}},
+                     {{o[0] + size, o[1] + size, o[2] + size}});
     }
+    void checkMemory(uint64_t wanted) const;
 
-    static void addSupport(const openvdb::Coord& origin, int64_t size, TreeScan& scan) {
-        const Int3 o{{origin.x(), origin.y(), origin.z()}};
-        scan.box.add({{o[0] - 1, o[1] - 1, o[2] - 1}}, {{o[0] + size, o[1] + size, o[2] + size}});
+    Entry constantEntry(const FieldValue& value);
+    const FieldValue& constantOf(Entry entry) const {
+        static constexpr FieldValue kNothing{};
+        return entry == SparseTable::kEmpty ? kNothing : constants_[entry & ~kConstantFlag];
     }
+    SparseTable sourceTable(const Int3& anchor, const IntBox& box);
+    template <class Stored>
+    ExtinctionField finish(RawArray<Stored>& values, const Int3& anchor);
 
-    static void scanLeaf(const Leaf& leaf, TreeScan& scan);
-    static void scanTile(const Tile& tile, TreeScan& scan);
-    void scanTree();
-
-    static void gather(Regions& regions, const Job& job, Vertices& out);
-    static void gatherCorner(const Leaf* leaf, const FieldValue& value, size_t corner,
-                             Vertices& out);
-
-    const TreeType& tree_;
-    std::vector<const Leaf*> leaves_;
-    std::vector<Tile> tiles_;
-    TreeScan scan_;
+    RegionSource<Value>& source_;
+    uint64_t maxMemory_;
+    std::string where_;
+    RegionScan scan_;
+    std::vector<FieldValue> constants_;
+    std::map<FieldValue, Entry> constantEntries_;
+    /// Of leaves of one value, that; of others, its first component is -1.
+    std::vector<FieldValue> leafConstants_;
+    RawArray<float> floats_;
+    RawArray<uint16_t> halfs_;
+    bool asHalfs_ = false;
 };
 
-template <class TreeType>
-void FieldBuilder<TreeType>::scanLeaf(const Leaf& leaf, TreeScan& scan) {
-    const Value* values = leaf.buffer().data();
-    const openvdb::Coord origin = leaf.origin();
-    uint64_t mask[8];
-    for (openvdb::Index w = 0; w < 8; ++w) {
-        mask[w] = leaf.valueMask().template getWord<uint64_t>(w);
-    }
-    const int32_t key[4] = {origin.x(), origin.y(), origin.z(), 0};
-    scan.digest +=
-        hashWords(values, Leaf::SIZE * sizeof(Value) / 8, hashWords(mask, 8, hashWords(key, 2, 0)));
-    scan.activeVoxels += leaf.onVoxelCount();
+namespace field_builder_internal {
 
+inline bool isStorable(float, const float*) {
+    return true;
+}
+inline bool isStorable(float value, const uint16_t*) {
+    return isExactHalf(value);
+}
+inline void store(float value, float& to) {
+    to = value;
+}
+inline void store(float value, uint16_t& to) {
+    to = encodeHalf(value);
+}
+
+}  // namespace field_builder_internal
+
+template <class Value>
+void FieldBuilder<Value>::checkMemory(uint64_t wanted) const {
+    if (maxMemory_ > 0 && wanted > maxMemory_) {
+        throw Error(TRK_ERROR_OUT_OF_MEMORY, where_ + ": needs " + std::to_string(wanted) +
+                                                 " bytes for its bricks, more than maxMemory = " +
+                                                 std::to_string(maxMemory_));
+    }
+}
+
+template <class Value>
+void FieldBuilder<Value>::scanValue(const Value& value, const Int3& at, uint64_t count,
+                                    RegionScan& scan) {
+    const FieldValue floats = toFloats(value);
+    // A double beyond float's range is infinite to the field.
+    if (!std::all_of(floats.begin(), floats.end(), [](float v) { return std::isfinite(v); })) {
+        scan.nonfinite.add(count, at);
+    } else if (std::any_of(floats.begin(), floats.end(), [](float v) { return v < 0; })) {
+        scan.negative.add(count, at);
+    }
+    for (const float f : fieldValue(value)) {
+        scan.addRange(f, f);
+    }
+}
+
+template <class Value>
+void FieldBuilder<Value>::scanLeaf(const Value* values, const uint64_t* mask, const Origin& origin,
+                                   RegionScan& scan, FieldValue* floats) {
+    const int32_t key[4] = {origin[0], origin[1], origin[2], 0};
+    scan.digest += hashWords(values, kLeafVoxels * sizeof(Value) / 8,
+                             hashWords(mask, 8, hashWords(key, 2, 0)));
+    for (size_t w = 0; w < 8; ++w) {
+        scan.activeVoxels += static_cast<uint64_t>(__builtin_popcountll(mask[w]));
+    }
     // First branch-free over all, as nearly every leaf is fine; then, where not, voxel by voxel.
-    constexpr size_t kCount = Leaf::SIZE * kChannels;
+    constexpr size_t kCount = kLeafVoxels * kChannels;
     const auto* components = ValueTraits<Value>::components(values);
+    float* to = floats->data();
     bool fine = true;
-    auto lo = static_cast<float>(components[0]);
-    float hi = lo;
+    float lo = std::numeric_limits<float>::infinity();
+    float hi = 0;
     for (size_t i = 0; i < kCount; ++i) {
         const auto v = static_cast<float>(components[i]);
         fine = fine & (v >= 0) & (v <= std::numeric_limits<float>::max());
         lo = std::min(lo, v);
         hi = std::max(hi, v);
+        to[i] = v + 0.0f;  // without negative zeros
     }
     if (fine) {
-        scan.addRange(lo, hi);
-        for (size_t i = 0; i < kCount && scan.exactHalfs; ++i) {
-            scan.exactHalfs = isExactHalf(static_cast<float>(components[i]));
-        }
+        scan.addRange(lo + 0.0f, hi);
     } else {
-        for (openvdb::Index i = 0; i < Leaf::SIZE; ++i) {
-            scanValue(values[i], leaf.offsetToGlobalCoord(i), 1, scan);
+        for (size_t i = 0; i < kLeafVoxels; ++i) {
+            const auto n = static_cast<int64_t>(i);
+            scanValue(values[i],
+                      {{origin[0] + (n >> 6), origin[1] + (n >> 3 & 7), origin[2] + (n & 7)}}, 1,
+                      scan);
+            floats[i] = fieldValue(values[i]);
         }
     }
     if (hi > 0 || !fine) {
-        addSupport(origin, Leaf::DIM, scan);
+        addSupport(origin, 8, scan);
     }
 }
 
-template <class TreeType>
-void FieldBuilder<TreeType>::scanTile(const Tile& tile, TreeScan& scan) {
+template <class Value>
+void FieldBuilder<Value>::scanTile(const Tile<Value>& tile, RegionScan& scan) {
     const int64_t size = int64_t{1} << tile.shift;
     const auto voxels = static_cast<uint64_t>(size * size * size);
-    const int32_t key[4] = {tile.origin.x(), tile.origin.y(), tile.origin.z(), tile.shift};
+    const int32_t key[4] = {tile.origin[0], tile.origin[1], tile.origin[2], tile.shift};
     double value[kChannels + 1];
     for (size_t c = 0; c < kChannels; ++c) {
         value[c] = static_cast<double>(ValueTraits<Value>::components(&tile.value)[c]);
@@ -248,173 +237,339 @@ void FieldBuilder<TreeType>::scanTile(const Tile& tile, TreeScan& scan) {
     value[kChannels] = tile.active ? 1.0 : 0.0;
     scan.digest += hashWords(value, kChannels + 1, hashWords(key, 2, 1));
     scan.activeVoxels += tile.active ? voxels : 0;
-    scanValue(tile.value, tile.origin, voxels, scan);
-    if (!(tile.value == openvdb::zeroVal<Value>())) {
+    scanValue(tile.value, {{tile.origin[0], tile.origin[1], tile.origin[2]}}, voxels, scan);
+    if (!(tile.value == Value{})) {
         addSupport(tile.origin, size, scan);
     }
 }
 
-template <class TreeType>
-void FieldBuilder<TreeType>::scanTree() {
-    const auto addTile = [&](const openvdb::Coord& origin, int shift, const Value& value,
-                             bool active) {
-        if (active || !(value == openvdb::zeroVal<Value>())) {
-            tiles_.push_back({origin, shift, value, active});
-        }
-    };
-    for (auto root = tree_.root().cbeginChildAll(); root; ++root) {
-        Value value{};
-        const auto* upper = root.probeChild(value);
-        if (!upper) {
-            addTile(root.getCoord(), 12, value, root.isValueOn());
-            continue;
-        }
-        for (auto u = upper->cbeginChildAll(); u; ++u) {
-            const auto* lower = u.probeChild(value);
-            if (!lower) {
-                addTile(u.getCoord(), 7, value, u.isValueOn());
+/// Scans with bricks of one type of storage; false where that cannot hold every value exactly.
+template <class Value>
+template <class Stored>
+bool FieldBuilder<Value>::tryScan(RawArray<Stored>& values) {
+    const size_t leafCount = source_.leafCount();
+    checkMemory(leafCount * kBrickValues * sizeof(Stored));
+    values.resize(leafCount * kBrickValues);
+    leafConstants_.resize(leafCount);
+    scan_ = {};
+    std::atomic<bool> exact{true};
+    struct Inexact {};
+    tbb::spin_mutex lock;
+    const auto body = [&](const LeafBatch<Value>& batch) {
+        RegionScan part;
+        std::array<FieldValue, kLeafVoxels> floats;
+        for (size_t i = 0; i < batch.count; ++i) {
+            const size_t leaf = batch.first + i;
+            scanLeaf(batch.leaf(i), batch.mask(i), source_.leafOrigins()[leaf], part,
+                     floats.data());
+            const float* from = floats[0].data();
+            bool storable = true;
+            if (sizeof(Stored) < sizeof(float)) {
+                for (size_t k = 0; k < kLeafVoxels * kChannels && storable; ++k) {
+                    storable = field_builder_internal::isStorable(from[k], values.data());
+                }
+            }
+            if (!storable) {
+                throw Inexact{};
+            }
+            const bool same = std::all_of(floats.begin(), floats.end(),
+                                          [&](const FieldValue& v) { return v == floats[0]; });
+            leafConstants_[leaf] = floats[0];
+            if (same) {
                 continue;
             }
-            for (auto l = lower->cbeginChildAll(); l; ++l) {
-                if (const Leaf* leaf = l.probeChild(value)) {
-                    leaves_.push_back(leaf);
-                } else {
-                    addTile(l.getCoord(), 3, value, l.isValueOn());
+            leafConstants_[leaf][0] = -1;
+            Stored* brick = &values[leaf * kBrickValues];
+            for (size_t row = 0; row < 64; ++row) {
+                Stored* to = brick + ((row >> 3) * 81 + (row & 7) * 9) * kChannels;
+                for (size_t k = 0; k < 8 * kChannels; ++k) {
+                    field_builder_internal::store(from[row * 8 * kChannels + k], to[k]);
                 }
             }
         }
-    }
-    scan_ = parallelSum<TreeScan>(leaves_.size(), 64,
-                                  [&](size_t i, TreeScan& part) { scanLeaf(*leaves_[i], part); });
-    for (const Tile& tile : tiles_) {
-        scanTile(tile, scan_);
-    }
-}
-
-template <class TreeType>
-void FieldBuilder<TreeType>::gatherCorner(const Leaf* leaf, const FieldValue& value, size_t corner,
-                                          Vertices& out) {
-    // The brick's own region gives 8 vertices an axis, an upper neighbour the one of the apron.
-    const size_t nx = corner & 4 ? 1 : 8;
-    const size_t ny = corner & 2 ? 1 : 8;
-    const size_t nz = corner & 1 ? 1 : 8;
-    const size_t first =
-        (corner & 4 ? 8 * 81 : 0) + (corner & 2 ? 8 * 9 : 0) + (corner & 1 ? 8 : 0);
-    const Value* values = leaf ? leaf->buffer().data() : nullptr;
-    for (size_t x = 0; x < nx; ++x) {
-        for (size_t y = 0; y < ny; ++y) {
-            FieldValue* row = &out[first + x * 81 + y * 9];
-            for (size_t z = 0; z < nz; ++z) {
-                row[z] = values ? fieldValue(values[x << 6 | y << 3 | z]) : value;
-            }
-        }
-    }
-}
-
-template <class TreeType>
-void FieldBuilder<TreeType>::gather(Regions& regions, const Job& job, Vertices& out) {
-    for (size_t corner = 0; corner < 8; ++corner) {
-        if (job.fromTiles) {
-            gatherCorner(nullptr, job.values[corner], corner, out);
-            continue;
-        }
-        const Int3 at{{job.origin[0] + (corner & 4 ? 8 : 0), job.origin[1] + (corner & 2 ? 8 : 0),
-                       job.origin[2] + (corner & 1 ? 8 : 0)}};
-        const Leaf* leaf = regions.leaf(at);
-        gatherCorner(leaf, leaf ? FieldValue{} : fieldValue(regions.value(at)), corner, out);
-    }
-}
-
-template <class TreeType>
-ExtinctionField FieldBuilder<TreeType>::build(const Int3& anchor, uint64_t maxMemory,
-                                              const std::string& where) const {
-    Plan plan;
-    IntBox box;
-    if (!scan_.box.empty()) {
-        for (size_t a = 0; a < 3; ++a) {
-            box.lo[a] = scan_.box.lo[a] - anchor[a];
-            box.hi[a] = scan_.box.hi[a] - anchor[a];
-        }
-    }
-    plan.table = SparseTable(ExtinctionField::kBrickShift, box);
-    Regions regions(tree_);
-    plan.table.fill(
-        [&](const Int3& local, int shift) -> std::optional<Entry> {
-            CornerValues values{};
-            const int64_t size = int64_t{1} << shift;
-            for (size_t corner = 0; corner < 8; ++corner) {
-                const Int3 at{{anchor[0] + local[0] + (corner & 4 ? size : 0),
-                               anchor[1] + local[1] + (corner & 2 ? size : 0),
-                               anchor[2] + local[2] + (corner & 1 ? size : 0)}};
-                const auto region = regions.uniform(at, shift);
-                if (!region) {
-                    return std::nullopt;
-                }
-                values[corner] = fieldValue(region->value);
-            }
-            return plan.sharedEntry(shift, values);
-        },
-        [&](const Int3& local) {
-            return plan.jobEntry(
-                {{{anchor[0] + local[0], anchor[1] + local[1], anchor[2] + local[2]}}, false, {}});
-        });
-
-    // First pass: which bricks are constant after all. Second: fill the others, exactly allocated.
-    const size_t jobCount = plan.jobs.size();
-    const auto forEachJob = [&](const auto& body) {
-        parallelRanges(jobCount, 64, [&](size_t begin, size_t end) {
-            Regions local(tree_);
-            Vertices vertices;
-            for (size_t i = begin; i != end; ++i) {
-                gather(local, plan.jobs[i], vertices);
-                body(i, vertices);
-            }
-        });
+        const tbb::spin_mutex::scoped_lock guard(lock);
+        scan_.join(part);
     };
-    FieldValue notConstant;
-    notConstant.fill(-1);
-    std::vector<FieldValue> constantOf(jobCount);
-    forEachJob([&](size_t i, const Vertices& vertices) {
-        const bool same = std::all_of(vertices.begin(), vertices.end(),
-                                      [&](const FieldValue& v) { return v == vertices[0]; });
-        constantOf[i] = same ? vertices[0] : notConstant;
-    });
-    std::vector<Entry> entryOf(jobCount);
-    size_t brickCount = 0;
-    for (size_t i = 0; i < jobCount; ++i) {
-        entryOf[i] = constantOf[i] == notConstant ? static_cast<Entry>(++brickCount)
-                                                  : plan.constantEntry(constantOf[i]);
+    try {
+        source_.forEachBatch(body);
+    } catch (const Inexact&) {
+        return false;
     }
-    const size_t valueCount = brickCount * kBrickVertices * kChannels;
-    const uint64_t wanted = valueCount * (scan_.exactHalfs ? 2 : 4);
-    if (maxMemory > 0 && wanted > maxMemory) {
-        throw Error(TRK_ERROR_OUT_OF_MEMORY, where + ": needs " + std::to_string(wanted) +
-                                                 " bytes for its bricks, more than maxMemory = " +
-                                                 std::to_string(maxMemory));
-    }
-    if (brickCount >= ExtinctionField::kConstantFlag) {
-        throw Error(TRK_ERROR_OUT_OF_MEMORY, where + ": has more than 2^30 bricks of 8^3 voxels");
-    }
-    std::vector<float> floats(scan_.exactHalfs ? 0 : valueCount);
-    std::vector<uint16_t> halfs(scan_.exactHalfs ? valueCount : 0);
-    forEachJob([&](size_t i, const Vertices& vertices) {
-        if (constantOf[i] != notConstant) {
-            return;
+    for (const Tile<Value>& tile : source_.tiles()) {
+        scanTile(tile, scan_);
+        for (const float v : fieldValue(tile.value)) {
+            exact = exact && field_builder_internal::isStorable(v, values.data());
         }
-        const float* from = vertices.front().data();
-        constexpr size_t kValues = kBrickVertices * kChannels;
-        const size_t to = (entryOf[i] - 1) * kValues;
-        if (scan_.exactHalfs) {
-            std::transform(from, from + kValues, &halfs[to], encodeHalf);
+    }
+    return exact;
+}
+
+template <class Value>
+const RegionScan& FieldBuilder<Value>::scan() {
+    if (source_.leafCount() >= kConstantFlag / 8) {
+        throw Error(TRK_ERROR_OUT_OF_MEMORY, where_ + ": has more than 2^27 leaves of 8^3 voxels");
+    }
+    // Most volumes of floats are found to be no halfs by their first leaf.
+    asHalfs_ = tryScan(halfs_);
+    if (!asHalfs_) {
+        halfs_.resize(0);
+        tryScan(floats_);
+    }
+    return scan_;
+}
+
+template <class Value>
+SparseTable::Entry FieldBuilder<Value>::constantEntry(const FieldValue& value) {
+    if (value == FieldValue{}) {
+        return SparseTable::kEmpty;
+    }
+    const auto [it, isNew] =
+        constantEntries_.try_emplace(value, static_cast<Entry>(constants_.size()) | kConstantFlag);
+    if (isNew) {
+        constants_.push_back(value);
+    }
+    return it->second;
+}
+
+/// The regions of the source: leaves, and constants where a leaf or tile has one value.
+template <class Value>
+SparseTable FieldBuilder<Value>::sourceTable(const Int3& anchor, const IntBox& box) {
+    SparseTable table(ExtinctionField::kBrickShift, box);
+    std::vector<SparseTable::Place> places;
+    places.reserve(source_.leafCount());
+    const auto local = [&](const Origin& o) {
+        return Int3{{o[0] - anchor[0], o[1] - anchor[1], o[2] - anchor[2]}};
+    };
+    for (size_t i = 0; i < source_.leafCount(); ++i) {
+        const bool same = leafConstants_[i][0] >= 0;
+        const Entry entry = same ? constantEntry(leafConstants_[i]) : static_cast<Entry>(i + 1);
+        if (entry != SparseTable::kEmpty) {
+            places.push_back(
+                {local(source_.leafOrigins()[i]), ExtinctionField::kBrickShift, entry});
+        }
+    }
+    for (const Tile<Value>& tile : source_.tiles()) {
+        const Entry entry = constantEntry(fieldValue(tile.value));
+        if (entry != SparseTable::kEmpty) {
+            const Int3 lo = local(tile.origin);
+            const int64_t size = int64_t{1} << tile.shift;
+            table.addBox({lo, {{lo[0] + size, lo[1] + size, lo[2] + size}}}, entry, places);
+        }
+    }
+    table.assemble(std::move(places));
+    return table;
+}
+
+/// Makes the field's table of the source's, and bricks of what its entries say.
+template <class Value>
+template <class Stored>
+class FieldBuilder<Value>::Bricks {
+  public:
+    Bricks(FieldBuilder& builder, RawArray<Stored>& values) : builder_(builder), values_(values) {
+        for (size_t i = 0; i < builder.leafConstants_.size(); ++i) {
+            if (builder.leafConstants_[i][0] >= 0) {
+                unused_.push_back(i);
+            }
+        }
+    }
+
+    /// The field's table; `values` grows by the bricks beside leaves.
+    SparseTable fill(const SparseTable& source, const IntBox& box) {
+        SparseTable table(ExtinctionField::kBrickShift, box);
+        table.fillFrom(source,
+                       [&](const Corners& corners, int shift) { return entryOf(corners, shift); });
+        return table;
+    }
+
+    const std::vector<Brick>& bricks() const { return bricks_; }
+    size_t slots() const { return builder_.leafConstants_.size() + added_; }
+    /// Slots of leaves that nothing is in, in rising order.
+    const std::vector<size_t>& unused() const { return unused_; }
+
+    /// Writes what of a brick is not its own leaf's.
+    void complete(const Brick& brick) {
+        Stored* to = &values_[(brick.entry - 1) * kBrickValues];
+        for (size_t corner = 0; corner < 8; ++corner) {
+            if (corner == 0 && isLeaf(brick.corners[0])) {
+                continue;
+            }
+            copyCorner(brick.corners[corner], corner, to);
+        }
+    }
+
+  private:
+    static bool isLeaf(Entry entry) {
+        return entry != SparseTable::kEmpty && (entry & kConstantFlag) == 0;
+    }
+
+    /// A corner's region gives a brick its own 8 vertices an axis, an upper neighbour 1. Calls
+    /// f(offset) for every row of `rowLength(corner)` values along z, until it answers false.
+    template <class F>
+    static bool forEachRow(size_t corner, const F& f) {
+        for (size_t x = 0; x < (corner & 4 ? 1u : 8u); ++x) {
+            for (size_t y = 0; y < (corner & 2 ? 1u : 8u); ++y) {
+                if (!f((x * 81 + y * 9) * kChannels)) {
+                    return false;
+                }
+            }
+        }
+        return true;
+    }
+    static size_t rowLength(size_t corner) { return (corner & 1 ? 1 : 8) * kChannels; }
+
+    /// A constant as stored, as often as the longest row has room for.
+    std::array<Stored, 8 * kChannels> constantRow(const FieldValue& value) const {
+        std::array<Stored, 8 * kChannels> row{};
+        for (size_t k = 0; k < row.size(); ++k) {
+            field_builder_internal::store(value[k % kChannels], row[k]);
+        }
+        return row;
+    }
+
+    void copyCorner(Entry from, size_t corner, Stored* brick) const {
+        const size_t first =
+            (corner & 4 ? 8 * 81 : 0) + (corner & 2 ? 8 * 9 : 0) + (corner & 1 ? 8 : 0);
+        Stored* to = brick + first * kChannels;
+        if (isLeaf(from)) {
+            const Stored* leaf = &values_[(from - 1) * kBrickValues];
+            forEachRow(corner, [&](size_t row) {
+                std::copy_n(leaf + row, rowLength(corner), to + row);
+                return true;
+            });
         } else {
-            std::copy(from, from + kValues, &floats[to]);
+            const auto constant = constantRow(builder_.constantOf(from));
+            forEachRow(corner, [&](size_t row) {
+                std::copy_n(constant.data(), rowLength(corner), to + row);
+                return true;
+            });
         }
-    });
-    SparseTable table = plan.table.mapped([&](Entry entry) {
-        return entry & ExtinctionField::kConstantFlag ? entry : entryOf[entry - 1];
-    });
-    return {kChannels, std::move(table), std::move(plan.constants), std::move(floats),
-            std::move(halfs)};
+    }
+
+    /// Whether all that a leaf gives to a brick, as its upper neighbour, is one value.
+    bool gives(Entry leaf, size_t corner, const FieldValue& value) const {
+        const Stored* from = &values_[(leaf - 1) * kBrickValues];
+        const auto constant = constantRow(value);
+        return forEachRow(corner, [&](size_t row) {
+            return std::equal(from + row, from + row + rowLength(corner), constant.data());
+        });
+    }
+
+    /// Entry of a region of the field of which the source's entries, at its corners, are no nodes;
+    /// nothing where its parts must be asked.
+    std::optional<Entry> entryOf(const Corners& corners, int shift) {
+        const bool same =
+            std::all_of(corners.begin(), corners.end(), [&](Entry e) { return e == corners[0]; });
+        if (same && !isLeaf(corners[0])) {
+            return corners[0];
+        }
+        if (shift > ExtinctionField::kBrickShift) {
+            return std::nullopt;
+        }
+        const bool fromLeaves = std::any_of(corners.begin(), corners.end(), isLeaf);
+        if (!fromLeaves) {  // alike all over the surface of a tile: built once
+            const auto [it, isNew] = shared_.try_emplace({0, corners}, SparseTable::kEmpty);
+            if (isNew) {
+                it->second = newSlot();
+                bricks_.push_back({corners, it->second});
+            }
+            return it->second;
+        }
+        if (!isLeaf(corners[0])) {
+            const FieldValue& own = builder_.constantOf(corners[0]);
+            bool constant = true;
+            for (size_t c = 1; c < 8 && constant; ++c) {
+                constant =
+                    isLeaf(corners[c]) ? gives(corners[c], c, own) : corners[c] == corners[0];
+            }
+            if (constant) {
+                return corners[0];
+            }
+        }
+        const Entry entry = isLeaf(corners[0]) ? corners[0] : newSlot();
+        bricks_.push_back({corners, entry});
+        return entry;
+    }
+
+    Entry newSlot() {
+        if (nextUnused_ < unused_.size()) {
+            return static_cast<Entry>(unused_[nextUnused_++] + 1);
+        }
+        return static_cast<Entry>(builder_.leafConstants_.size() + ++added_);
+    }
+
+  public:
+    /// Slots of leaves that were left empty, once everything is filled.
+    std::vector<size_t> holes() const {
+        return {unused_.begin() + static_cast<std::ptrdiff_t>(nextUnused_), unused_.end()};
+    }
+
+  private:
+    FieldBuilder& builder_;
+    RawArray<Stored>& values_;
+    std::vector<Brick> bricks_;
+    std::unordered_map<std::pair<int, Corners>, Entry, CornersHash> shared_;
+    std::vector<size_t> unused_;  // slots of leaves of one value
+    size_t nextUnused_ = 0;
+    size_t added_ = 0;
+};
+
+template <class Value>
+template <class Stored>
+ExtinctionField FieldBuilder<Value>::finish(RawArray<Stored>& values, const Int3& anchor) {
+    IntBox box;
+    const auto toLocal = [&](const IntBox& index) {
+        IntBox local;
+        for (size_t a = 0; a < 3; ++a) {
+            local.lo[a] = index.lo[a] - anchor[a];
+            local.hi[a] = index.hi[a] - anchor[a];
+        }
+        return local;
+    };
+    if (!scan_.box.empty()) {
+        box = toLocal(scan_.box);
+    }
+    Bricks<Stored> bricks(*this, values);
+    SparseTable table;
+    {
+        const SparseTable source = sourceTable(anchor, box);
+        table = bricks.fill(source, box);
+    }
+    checkMemory(bricks.slots() * kBrickValues * sizeof(Stored));
+    values.resize(bricks.slots() * kBrickValues);
+    const std::vector<Brick>& list = bricks.bricks();
+    parallelFor(list.size(), 64, [&](size_t i) { bricks.complete(list[i]); });
+    // Close what leaves of one value have left.
+    const std::vector<size_t> holes = bricks.holes();
+    if (!holes.empty()) {
+        std::vector<Entry> moved(bricks.slots() + 1);
+        size_t next = 0;
+        size_t hole = 0;
+        for (size_t slot = 0; slot < bricks.slots(); ++slot) {
+            if (hole < holes.size() && holes[hole] == slot) {
+                ++hole;
+                continue;
+            }
+            if (next != slot) {
+                std::memmove(&values[next * kBrickValues], &values[slot * kBrickValues],
+                             kBrickValues * sizeof(Stored));
+            }
+            moved[slot + 1] = static_cast<Entry>(++next);
+        }
+        values.resize(next * kBrickValues);
+        table =
+            table.mapped([&](Entry entry) { return entry & kConstantFlag ? entry : moved[entry]; });
+    }
+    std::vector<float> constants;
+    for (const FieldValue& value : constants_) {
+        constants.insert(constants.end(), value.begin(), value.end());
+    }
+    return {kChannels, std::move(table), std::move(constants), std::move(floats_),
+            std::move(halfs_)};
+}
+
+template <class Value>
+ExtinctionField FieldBuilder<Value>::build(const Int3& anchor) {
+    return asHalfs_ ? finish(halfs_, anchor) : finish(floats_, anchor);
 }
 
 }  // namespace trk

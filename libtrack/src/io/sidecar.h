@@ -53,9 +53,10 @@ SidecarHeader readSidecarHeader(const std::string& path, const GridIdentity* sou
 enum class SidecarParts { kQueries, kAll };
 
 /// The bake, checked as far as `check` says, against `density` unless that is NULL (a sidecar
-/// opened alone, whose anchor is then its own).
+/// opened alone, whose anchor is then its own). Throws Error: OUT_OF_MEMORY where reading it would
+/// take more than `maxMemory` bytes (0: no limit).
 Sidecar readSidecar(const std::string& path, const DensitySummary* density, TrkCheck check,
-                    SidecarParts parts = SidecarParts::kQueries);
+                    SidecarParts parts = SidecarParts::kQueries, uint64_t maxMemory = 0);
 
 /// Writes the grids one after another, so that only one is in memory at a time. Does not commit.
 /// `header.origin` is chosen here.

@@ -17,12 +17,12 @@ using namespace schema;
 
 namespace {
 
-int metaNumber(const openvdb::GridBase& grid, const char* name, const std::string& where) {
-    const auto meta = grid.getMetadata<openvdb::Int32Metadata>(name);
-    if (!meta) {
+int metaNumber(const VdbMetadata& metadata, const char* name, const std::string& where) {
+    const auto number = metadata.int32(name);
+    if (!number) {
         badSidecar(where, std::string("no metadata ") + name + "; not a sidecar of this tool");
     }
-    return meta->value();
+    return *number;
 }
 
 bool hasSuffix(const std::string& name, const std::string& suffix) {
@@ -39,12 +39,12 @@ const VdbEntry* findControl(VdbFile& file, const GridIdentity* source) {
             continue;
         }
         first = first ? first : &entry;
-        const openvdb::GridBase::Ptr grid = source ? file.readMetadata(entry) : nullptr;
-        const auto name =
-            grid ? grid->getMetadata<openvdb::StringMetadata>("track_source_grid") : nullptr;
-        const auto index =
-            grid ? grid->getMetadata<openvdb::Int32Metadata>("track_source_index") : nullptr;
-        if (name && index && name->value() == source->name && index->value() == source->index) {
+        if (!source) {
+            break;
+        }
+        const VdbMetadata metadata = file.readHeader(entry).metadata;
+        if (metadata.text("track_source_grid") == source->name &&
+            metadata.int32("track_source_index") == source->index) {
             return &entry;
         }
     }
@@ -61,16 +61,16 @@ void badSidecar(const std::string& where, const std::string& what) {
     throw Error(TRK_ERROR_BAD_FILE, where + ": " + what);
 }
 
-std::string metaText(const openvdb::GridBase& grid, const char* name, const std::string& where) {
-    const auto meta = grid.getMetadata<openvdb::StringMetadata>(name);
-    if (!meta) {
+std::string metaText(const VdbMetadata& metadata, const char* name, const std::string& where) {
+    const auto text = metadata.text(name);
+    if (!text) {
         badSidecar(where, std::string("no metadata ") + name + "; not a sidecar of this tool");
     }
-    return meta->value();
+    return *text;
 }
 
-void checkFormat(const openvdb::GridBase& grid, const std::string& where) {
-    const std::string format = metaText(grid, "track_format", where);
+void checkFormat(const VdbMetadata& metadata, const std::string& where) {
+    const std::string format = metaText(metadata, "track_format", where);
     const int major = std::atoi(format.c_str());
     if (major < 1) {
         badSidecar(where, "sidecar format is \"" + format + "\"; expected " + kFormat);
@@ -89,31 +89,26 @@ SidecarHeader readHeader(VdbFile& file, const GridIdentity* source) {
                    "no grid …_control; expected a sidecar; the file has " + file.listing());
     }
     const std::string where = file.path() + ": grid " + control->name;
-    const openvdb::GridBase::Ptr grid = file.readMetadata(*control);
-    if (!grid) {
-        badSidecar(where, "has the unknown type " + control->type);
-    }
-    checkFormat(*grid, where);
+    const VdbGridHeader grid = file.readHeader(*control);
+    const VdbMetadata& metadata = grid.metadata;
+    checkFormat(metadata, where);
     SidecarHeader header;
     header.prefix = control->name.substr(0, control->name.size() - std::strlen(kControlSuffix));
-    header.format = metaText(*grid, "track_format", where);
-    header.toolVersion = metaText(*grid, "track_tool_version", where);
-    header.sourceFile = metaText(*grid, "track_source_file", where);
-    header.source.name = metaText(*grid, "track_source_grid", where);
-    header.source.index = metaNumber(*grid, "track_source_index", where);
+    header.format = metaText(metadata, "track_format", where);
+    header.toolVersion = metaText(metadata, "track_tool_version", where);
+    header.sourceFile = metaText(metadata, "track_source_file", where);
+    header.source.name = metaText(metadata, "track_source_grid", where);
+    header.source.index = metaNumber(metadata, "track_source_index", where);
     header.digest =
-        std::strtoull(metaText(*grid, "track_source_digest", where).c_str(), nullptr, 16);
-    header.superVoxelSize = metaNumber(*grid, "track_super_voxel_size", where);
-    header.levels = metaNumber(*grid, "track_levels", where);
-    header.previewSize = metaNumber(*grid, "track_preview_size", where);
-    const auto scale = grid->getMetadata<openvdb::DoubleMetadata>("track_preview_scale");
-    header.previewScale = scale ? scale->value() : 1;
-    const auto origin = grid->getMetadata<openvdb::Vec3DMetadata>("track_origin");
-    const auto bytes = grid->getMetadata<openvdb::Int64Metadata>("track_source_bytes");
-    const auto modified = grid->getMetadata<openvdb::Int64Metadata>("track_source_modified");
-    header.sourceBytes = bytes ? static_cast<uint64_t>(bytes->value()) : 0;
-    header.sourceModified = modified ? modified->value() : 0;
-    header.valueType = grid->valueType();
+        std::strtoull(metaText(metadata, "track_source_digest", where).c_str(), nullptr, 16);
+    header.superVoxelSize = metaNumber(metadata, "track_super_voxel_size", where);
+    header.levels = metaNumber(metadata, "track_levels", where);
+    header.previewSize = metaNumber(metadata, "track_preview_size", where);
+    header.previewScale = metadata.real("track_preview_scale").value_or(1);
+    const auto origin = metadata.vec3d("track_origin");
+    header.sourceBytes = static_cast<uint64_t>(metadata.int64("track_source_bytes").value_or(0));
+    header.sourceModified = metadata.int64("track_source_modified").value_or(0);
+    header.valueType = valueTypeName(control->type);
     const int size = header.superVoxelSize;
     if (size < 4 || size > 64 || (size & (size - 1)) != 0) {
         badSidecar(where, "super-voxel size " + std::to_string(size) +
@@ -134,7 +129,7 @@ SidecarHeader readHeader(VdbFile& file, const GridIdentity* source) {
                               "; expected a finite number >= 0");
     }
     for (int a = 0; a < 3; ++a) {
-        const double x = origin ? origin->value()[a] : std::numeric_limits<double>::quiet_NaN();
+        const double x = origin ? (*origin)[a] : std::numeric_limits<double>::quiet_NaN();
         if (!(std::fabs(x) < 0x1p33) || x != std::floor(x) ||
             (static_cast<int64_t>(x) & (size - 1)) != 0) {
             badSidecar(where,
@@ -142,8 +137,8 @@ SidecarHeader readHeader(VdbFile& file, const GridIdentity* source) {
         }
         header.origin[static_cast<size_t>(a)] = static_cast<int64_t>(x);
     }
-    const std::string kind = metaText(*grid, "track_control", where);
-    const std::string interpolation = metaText(*grid, "track_interpolation", where);
+    const std::string kind = metaText(metadata, "track_control", where);
+    const std::string interpolation = metaText(metadata, "track_interpolation", where);
     bool known = false;
     for (const ControlKind k :
          {ControlKind::kConstant, ControlKind::kTrilinear, ControlKind::kAffine}) {
@@ -158,20 +153,20 @@ SidecarHeader readHeader(VdbFile& file, const GridIdentity* source) {
                         "\"; this build reads constant, trilinear and affine controls of "
                         "trilinear fields");
     }
-    if (channelCount(header.valueType) == 0) {
+    if (channelCount(header.valueType) == 0 || control->type != treeTypeName(header.valueType)) {
         badSidecar(where,
                    "is of type " + header.valueType + "; expected float, double, vec3s or vec3d");
     }
-    if (const auto meta = grid->getMetadata<openvdb::Int64Metadata>("track_dropped_nonfinite")) {
+    if (const auto dropped = metadata.int64("track_dropped_nonfinite")) {
         header.repair |= TRK_REPAIR_DROP_NONFINITE;
-        header.dropped = static_cast<uint64_t>(meta->value());
+        header.dropped = static_cast<uint64_t>(*dropped);
     }
-    if (const auto meta = grid->getMetadata<openvdb::Int64Metadata>("track_clamped_negative")) {
+    if (const auto clamped = metadata.int64("track_clamped_negative")) {
         header.repair |= TRK_REPAIR_CLAMP_NEGATIVE;
-        header.clamped = static_cast<uint64_t>(meta->value());
+        header.clamped = static_cast<uint64_t>(*clamped);
     }
     const bool atCorners = header.controlKind == ControlKind::kTrilinear;
-    header.indexToWorld = sourceMap(affineMap(grid->constTransform(), where), header.origin, size,
+    header.indexToWorld = sourceMap(affineMap(*grid.transform, where), header.origin, size,
                                     atCorners ? 0 : centreOffset(size));
     return header;
 }
@@ -211,8 +206,7 @@ void checkAgainst(const SidecarHeader& header, const DensitySummary& density, Tr
 bool isSidecar(const std::string& path) {
     VdbFile file(path);
     const VdbEntry* control = findControl(file, nullptr);
-    const openvdb::GridBase::Ptr grid = control ? file.readMetadata(*control) : nullptr;
-    return grid && grid->getMetadata<openvdb::StringMetadata>("track_format");
+    return control && file.readHeader(*control).metadata.text("track_format");
 }
 
 SidecarHeader readSidecarHeader(const std::string& path, const GridIdentity* source) {

@@ -14,10 +14,10 @@ namespace trk {
 [[noreturn]] void badSidecar(const std::string& where, const std::string& what);
 
 /// Text metadata of a grid. `where` begins the message if there is none.
-std::string metaText(const openvdb::GridBase& grid, const char* name, const std::string& where);
+std::string metaText(const VdbMetadata& metadata, const char* name, const std::string& where);
 
 /// Throws where a grid's format is none, or newer than this build's.
-void checkFormat(const openvdb::GridBase& grid, const std::string& where);
+void checkFormat(const VdbMetadata& metadata, const std::string& where);
 
 /// As readSidecarHeader.
 SidecarHeader readHeader(VdbFile& file, const GridIdentity* source);

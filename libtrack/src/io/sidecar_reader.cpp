@@ -6,8 +6,10 @@
 #include "density_types.h"
 #include "sidecar_header.h"
 #include "sidecar_schema.h"
-#include "tree_regions.h"
 #include "vdb_file.h"
+#include "vdb_tree.h"
+
+#include <tbb/spin_mutex.h>
 
 #include <algorithm>
 #include <array>
@@ -37,11 +39,13 @@ const VdbEntry& findGrid(const VdbFile& file, const std::string& name) {
 
 class SidecarReader {
   public:
-    SidecarReader(VdbFile& file, const SidecarHeader& header, TrkCheck check, SidecarParts parts)
+    SidecarReader(VdbFile& file, const SidecarHeader& header, TrkCheck check, SidecarParts parts,
+                  uint64_t maxMemory)
         : file_(file),
           header_(header),
           check_(check),
           parts_(parts),
+          maxMemory_(maxMemory),
           hasGradients_(parts == SidecarParts::kAll || header.controlKind == ControlKind::kAffine),
           prefix_(header.prefix),
           channels_(static_cast<size_t>(channelCount(header.valueType))),
@@ -72,29 +76,23 @@ class SidecarReader {
             findGrid(file_, prefix_ + previewSuffix(header_.previewSize));
         }
         if (baked.kind == ControlKind::kTrilinear) {
-            const auto grid = readGrid(header_.valueType, kControlSuffix, shift_, 0);
-            checkAnchor(supportBox(*grid, shift_), sidecar.anchor, grid->getName());
-            corners_ = makeTable(*grid, shift_, sidecar.anchor, Values::kNotNegative);
+            corners_ = readTable(kControlSuffix, shift_, 0, sidecar.anchor);
         }
         join(sidecar);
         tables_.clear();
         for (int level = 1; level <= header_.levels; ++level) {
             const int shift = shift_ + level;
-            const auto grid =
-                readGrid(header_.valueType, levelSuffix(level), shift, centreOffset(1 << shift));
-            checkAnchor(supportBox(*grid, shift), sidecar.anchor, grid->getName());
-            baked.levels.push_back(makeTable(*grid, shift, sidecar.anchor, Values::kNotNegative));
+            baked.levels.push_back(
+                readTable(levelSuffix(level), shift, centreOffset(1 << shift), sidecar.anchor));
         }
         if (parts_ == SidecarParts::kAll && header_.previewSize > 0) {
             int shift = 0;
             while (1 << shift < header_.previewSize) {
                 ++shift;
             }
-            const auto grid = readGrid(header_.valueType, previewSuffix(header_.previewSize), shift,
-                                       centreOffset(header_.previewSize));
-            checkAnchor(supportBox(*grid, shift), sidecar.anchor, grid->getName());
             baked.previewSize = header_.previewSize;
-            baked.preview = makeTable(*grid, shift, sidecar.anchor, Values::kNotNegative);
+            baked.preview = readTable(previewSuffix(header_.previewSize), shift,
+                                      centreOffset(header_.previewSize), sidecar.anchor);
         }
     }
 
@@ -113,18 +111,24 @@ class SidecarReader {
     /// Reads a grid of one value per super-voxel; all of them cover one box.
     void readItems(const std::string& valueType, const std::string& suffix, Values values,
                    const Int3* anchor, Sidecar& sidecar) {
-        const auto grid = readGrid(valueType, suffix, shift_, centreOffset(header_.superVoxelSize));
-        const IntBox support = supportBox(*grid, shift_);
+        const ActiveGrid grid =
+            readGrid(valueType, suffix, shift_, centreOffset(header_.superVoxelSize));
         if (tables_.empty()) {
-            box_ = support;
+            box_ = grid.support;
             sidecar.anchor = anchor ? *anchor : anchorFor(box_);
         }
-        if (support.lo != box_.lo || support.hi != box_.hi) {
-            badSidecar(file_.path(), "grid " + grid->getName() + " covers another box than " +
-                                         prefix_ + statistics_[0].suffix);
+        if (grid.support.lo != box_.lo || grid.support.hi != box_.hi) {
+            badSidecar(file_.path(), "grid " + grid.name + " covers another box than " + prefix_ +
+                                         statistics_[0].suffix);
         }
-        checkAnchor(support, sidecar.anchor, grid->getName());
-        tables_.push_back(makeTable(*grid, shift_, sidecar.anchor, values));
+        tables_.push_back(makeTable(grid, shift_, sidecar.anchor, values));
+    }
+
+    /// A grid of values of the density's type, not negative.
+    ValueTable readTable(const std::string& suffix, int shift, double offset,
+                         const Int3& anchor) const {
+        return makeTable(readGrid(header_.valueType, suffix, shift, offset), shift, anchor,
+                         Values::kNotNegative);
     }
 
     /// Makes super-voxels of the tables of their statistics and shapes; equal ones are one.
@@ -133,7 +137,12 @@ class SidecarReader {
         const bool trilinear = baked.kind == ControlKind::kTrilinear;
         std::unordered_map<Entries, SparseTable::Entry, Hash> known;
         baked.table = SparseTable(shift_, toLocal(box_, sidecar.anchor));
+        SparseTable::Sources sources;
+        for (const ValueTable& table : tables_) {
+            sources.push_back(&table.table);
+        }
         baked.table.fill(
+            sources,
             [&](const Int3& local, int shift) -> std::optional<SparseTable::Entry> {
                 Entries entries{};
                 size_t empty = 0;
@@ -273,104 +282,246 @@ class SidecarReader {
                std::to_string(at[2]) + ")";
     }
 
-    openvdb::GridBase::Ptr readGrid(const std::string& valueType, const std::string& suffix,
-                                    int shift, double offset) {
+    static constexpr size_t kLeafVoxels = LeafBatch<float>::kLeafVoxels;
+    using Floats = std::array<float, 3>;
+
+    /// Active values of a leaf.
+    struct Leaf {
+        std::array<uint64_t, 8> mask;
+        std::vector<Floats> values;
+
+        bool isActive(size_t i) const { return (mask[i >> 6] >> (i & 63) & 1) != 0; }
+    };
+    /// A grid's active values, equal leaves once.
+    struct ActiveGrid {
+        std::string name;
+        size_t channels = 1;
+        IntBox support;  // in the source's index space
+        std::vector<Leaf> leaves;
+        std::vector<std::pair<Int3, size_t>> places;  // origin of a leaf, and which one it is
+        std::vector<std::pair<IntBox, Floats>> tiles;
+    };
+
+    ActiveGrid readGrid(const std::string& valueType, const std::string& suffix, int shift,
+                        double offset) const {
         const std::string name = prefix_ + suffix;
         const VdbEntry& entry = findGrid(file_, name);
         const std::string place = file_.path() + ": grid " + name;
         if (entry.type != treeTypeName(valueType)) {
             badSidecar(place, "is of type " + entry.type + "; expected " + treeTypeName(valueType));
         }
-        openvdb::GridBase::Ptr grid = file_.read(entry);
-        checkFormat(*grid, place);
-        if (metaText(*grid, "track_source_digest", place) != hexDigest(header_.digest)) {
+        const VdbGridHeader header = file_.readHeader(entry);
+        checkFormat(header.metadata, place);
+        if (metaText(header.metadata, "track_source_digest", place) != hexDigest(header_.digest)) {
             badSidecar(place, "comes from another bake than the file's other grids");
         }
         const AffineMap expected =
             superVoxelMap(header_.indexToWorld, header_.origin, 1 << shift, offset);
-        if (!sameMap(expected, affineMap(grid->constTransform(), place))) {
+        if (!sameMap(expected, affineMap(*header.transform, place))) {
             badSidecar(place, "does not lie over the file's control grid: its transform differs");
         }
-        grid->apply<DensityGrids>([&](const auto& typed) {
-            using Value = typename std::decay_t<decltype(typed)>::ValueType;
-            if (!(typed.background() == openvdb::zeroVal<Value>())) {
+        ActiveGrid grid;
+        grid.name = name;
+        grid.channels = static_cast<size_t>(channelCount(valueType));
+        withValueType(valueType, [&](auto zero) {
+            VdbTree<decltype(zero)> tree(file_, entry, maxMemory_);
+            if (!(tree.background() == zero)) {
                 badSidecar(place, "background is not 0");
             }
+            collect(tree, place, grid);
         });
+        IntBox box;
+        std::vector<IntBox> leafBoxes(grid.leaves.size());
+        for (size_t l = 0; l < grid.leaves.size(); ++l) {
+            for (size_t i = 0; i < kLeafVoxels; ++i) {
+                if (grid.leaves[l].isActive(i)) {
+                    const Int3 at = SparseTable::childOrigin({{0, 0, 0}}, 0, i);
+                    leafBoxes[l].add(at, {{at[0] + 1, at[1] + 1, at[2] + 1}});
+                }
+            }
+        }
+        for (const auto& [origin, leaf] : grid.places) {
+            if (!leafBoxes[leaf].empty()) {
+                box.add(plus(origin, leafBoxes[leaf].lo), plus(origin, leafBoxes[leaf].hi));
+            }
+        }
+        for (const auto& [tileBox, value] : grid.tiles) {
+            box.add(tileBox.lo, tileBox.hi);
+        }
+        for (size_t a = 0; a < 3 && !box.empty(); ++a) {
+            grid.support.lo[a] = (box.lo[a] << shift) + header_.origin[a];
+            grid.support.hi[a] = (box.hi[a] << shift) + header_.origin[a];
+        }
         return grid;
     }
 
-    /// In the source's index space.
-    IntBox supportBox(const openvdb::GridBase& grid, int shift) const {
-        IntBox box;
-        const openvdb::CoordBBox active = grid.evalActiveVoxelBoundingBox();
-        if (!active.empty()) {
-            const int64_t size = int64_t{1} << shift;
-            Int3 lo = toInt3(active.min());
-            Int3 hi = toInt3(active.max());
-            for (size_t a = 0; a < 3; ++a) {
-                lo[a] = lo[a] * size + header_.origin[a];
-                hi[a] = (hi[a] + 1) * size + header_.origin[a];
-            }
-            box.add(lo, hi);
-        }
-        return box;
+    static Int3 plus(const Int3& a, const Int3& b) {
+        return {{a[0] + b[0], a[1] + b[1], a[2] + b[2]}};
     }
 
-    /// The active values of a grid, as a table over local space.
-    ValueTable makeTable(const openvdb::GridBase& grid, int shift, const Int3& anchor,
-                         Values values) const {
-        ValueTable result;
-        result.table = SparseTable(shift, toLocal(supportBox(grid, shift), anchor));
-        grid.apply<DensityGrids>([&](const auto& typed) {
-            fillTable(typed.tree(), grid.getName(), shift, anchor, values, result);
-        });
+    template <class Value>
+    static Floats floatsOf(const Value& value) {
+        Floats result{};
+        const auto floats = toFloats(value);
+        std::copy(floats.begin(), floats.end(), result.begin());
         return result;
     }
 
-    template <class TreeType>
-    void fillTable(const TreeType& tree, const std::string& name, int shift, const Int3& anchor,
-                   Values values, ValueTable& result) const {
-        using Floats = Sample<typename TreeType::ValueType>;
-        const auto hash = [](const Floats& floats) {
-            uint64_t words[2] = {0, 0};
-            std::memcpy(words, floats.data(), sizeof(floats));
-            return hashWords(words, 2, 0);
+    /// Reads the active values of a grid.
+    template <class Value>
+    void collect(VdbTree<Value>& tree, const std::string& place, ActiveGrid& grid) const {
+        std::vector<size_t> which(tree.leafCount());
+        std::unordered_multimap<uint64_t, size_t> known;
+        tbb::spin_mutex lock;
+        tree.forEachBatch([&](const LeafBatch<Value>& batch) {
+            for (size_t i = 0; i < batch.count; ++i) {
+                Leaf leaf;
+                std::copy_n(batch.mask(i), leaf.mask.size(), leaf.mask.begin());
+                leaf.values.resize(kLeafVoxels);
+                for (size_t v = 0; v < kLeafVoxels; ++v) {
+                    if (leaf.isActive(v)) {
+                        leaf.values[v] = floatsOf(batch.leaf(i)[v]);
+                    }
+                }
+                const uint64_t hash =
+                    hashWords(leaf.values.data(), kLeafVoxels * sizeof(Floats) / 8,
+                              hashWords(leaf.mask.data(), 8, 0));
+                const tbb::spin_mutex::scoped_lock guard(lock);
+                which[batch.first + i] = addLeaf(std::move(leaf), hash, known, grid.leaves);
+            }
+            const uint64_t held = grid.leaves.size() * kLeafVoxels * sizeof(Floats);
+            if (maxMemory_ > 0 && held > maxMemory_) {
+                throw Error(TRK_ERROR_OUT_OF_MEMORY,
+                            place + ": reading it takes more than maxMemory = " +
+                                std::to_string(maxMemory_) + " bytes");
+            }
+        });
+        for (size_t i = 0; i < which.size(); ++i) {
+            const auto& o = tree.leafOrigins()[i];
+            grid.places.emplace_back(Int3{{o[0], o[1], o[2]}}, which[i]);
+        }
+        for (const Tile<Value>& tile : tree.tiles()) {
+            if (tile.active) {
+                const Int3 lo{{tile.origin[0], tile.origin[1], tile.origin[2]}};
+                const int64_t edge = int64_t{1} << tile.shift;
+                grid.tiles.emplace_back(IntBox{lo, plus(lo, {{edge, edge, edge}})},
+                                        floatsOf(tile.value));
+            }
+        }
+    }
+
+    /// Index of an equal leaf, or of a new one.
+    static size_t addLeaf(Leaf&& leaf, uint64_t hash,
+                          std::unordered_multimap<uint64_t, size_t>& known,
+                          std::vector<Leaf>& leaves) {
+        const auto [begin, end] = known.equal_range(hash);
+        for (auto it = begin; it != end; ++it) {
+            const Leaf& other = leaves[it->second];
+            if (other.mask == leaf.mask && std::memcmp(other.values.data(), leaf.values.data(),
+                                                       kLeafVoxels * sizeof(Floats)) == 0) {
+                return it->second;
+            }
+        }
+        known.emplace(hash, leaves.size());
+        leaves.push_back(std::move(leaf));
+        return leaves.size() - 1;
+    }
+
+    /// Gives every value of a table an entry; equal ones have one.
+    class ValueEntries {
+      public:
+        ValueEntries(size_t channels, std::vector<float>& values)
+            : channels_(channels), values_(values) {}
+
+        SparseTable::Entry of(const Floats& value) {
+            if (last_ == SparseTable::kEmpty || value != lastValue_) {
+                const auto [it, isNew] = known_.try_emplace(
+                    value, static_cast<SparseTable::Entry>(values_.size() / channels_ + 1));
+                if (isNew) {
+                    values_.insert(values_.end(), value.begin(),
+                                   value.begin() + static_cast<std::ptrdiff_t>(channels_));
+                }
+                last_ = it->second;
+                lastValue_ = value;
+            }
+            return last_;
+        }
+
+      private:
+        struct FloatsHash {
+            size_t operator()(const Floats& floats) const {
+                uint64_t words[2] = {0, 0};
+                std::memcpy(words, floats.data(), sizeof(floats));
+                return hashWords(words, 2, 0);
+            }
         };
-        std::unordered_map<Floats, SparseTable::Entry, decltype(hash)> known(64, hash);
-        SparseTable::Entry last = SparseTable::kEmpty;
-        Floats lastFloats{};
-        TreeRegions<TreeType> regions(tree);
-        result.table.fill(
-            [&](const Int3& local, int regionShift) -> std::optional<SparseTable::Entry> {
-                const Int3 at = gridIndex(local, shift, anchor);
-                const auto region = regions.uniform(at, regionShift - shift);
-                if (!region) {
-                    return std::nullopt;
+        size_t channels_;
+        std::vector<float>& values_;
+        std::unordered_map<Floats, SparseTable::Entry, FloatsHash> known_;
+        SparseTable::Entry last_ = SparseTable::kEmpty;
+        Floats lastValue_{};
+    };
+
+    /// The active values of a grid, as a table over local space.
+    ValueTable makeTable(const ActiveGrid& grid, int shift, const Int3& anchor,
+                         Values values) const {
+        checkAnchor(grid.support, anchor, grid.name);
+        ValueTable result;
+        SparseTable& table = result.table;
+        table = SparseTable(shift, toLocal(grid.support, anchor));
+        ValueEntries entries(grid.channels, result.values);
+        const auto entryOf = [&](const Floats& value, const Int3& at) {
+            for (size_t c = 0; c < grid.channels; ++c) {
+                if (!std::isfinite(value[c]) || (values == Values::kNotNegative && value[c] < 0)) {
+                    badSidecar(file_.path(), "grid " + grid.name + ": " + where(at) +
+                                                 " is negative, NaN or infinite");
                 }
-                if (!region->active) {
-                    return SparseTable::kEmpty;
+            }
+            return entries.of(value);
+        };
+        const auto local = [&](const Int3& at) {
+            Int3 place{};
+            for (size_t a = 0; a < 3; ++a) {
+                place[a] = (at[a] << shift) + header_.origin[a] - anchor[a];
+            }
+            return place;
+        };
+        // Equal leaves become one node, where the table's nodes lie as the grid's leaves do.
+        const int64_t offLeaf =
+            (local({{0, 0, 0}})[0] | local({{0, 0, 0}})[1] | local({{0, 0, 0}})[2]) &
+            ((int64_t{8} << shift) - 1);
+        std::vector<SparseTable::Node> nodes(grid.leaves.size());
+        std::vector<SparseTable::Entry> nodeEntries(grid.leaves.size());
+        std::vector<SparseTable::Place> places;
+        std::vector<bool> made(grid.leaves.size());
+        for (const auto& [origin, l] : grid.places) {
+            const Leaf& leaf = grid.leaves[l];
+            SparseTable::Node& node = nodes[l];
+            if (!made[l]) {
+                for (size_t i = 0; i < kLeafVoxels; ++i) {
+                    node[i] = leaf.isActive(i)
+                                  ? entryOf(leaf.values[i], SparseTable::childOrigin(origin, 0, i))
+                                  : SparseTable::kEmpty;
                 }
-                const Floats floats = toFloats(region->value);
-                for (const float value : floats) {
-                    if (!std::isfinite(value) || (values == Values::kNotNegative && value < 0)) {
-                        badSidecar(file_.path(), "grid " + name + ": " + where(at) +
-                                                     " is negative, NaN or infinite");
-                    }
+                nodeEntries[l] = offLeaf == 0 ? table.addNode(node) : SparseTable::kEmpty;
+                made[l] = true;
+            }
+            if (nodeEntries[l] != SparseTable::kEmpty) {
+                places.push_back({local(origin), shift + 3, nodeEntries[l]});
+                continue;
+            }
+            for (size_t i = 0; i < kLeafVoxels; ++i) {
+                if (node[i] != SparseTable::kEmpty) {
+                    places.push_back(
+                        {local(SparseTable::childOrigin(origin, 0, i)), shift, node[i]});
                 }
-                if (last == SparseTable::kEmpty || floats != lastFloats) {
-                    const size_t next = result.values.size() / floats.size() + 1;
-                    const auto [it, isNew] =
-                        known.try_emplace(floats, static_cast<SparseTable::Entry>(next));
-                    if (isNew) {
-                        result.values.insert(result.values.end(), floats.begin(), floats.end());
-                    }
-                    last = it->second;
-                    lastFloats = floats;
-                }
-                return last;
-            },
-            [](const Int3&) { return SparseTable::kEmpty; });  // a super-voxel is always uniform
+            }
+        }
+        for (const auto& [box, value] : grid.tiles) {
+            table.addBox({local(box.lo), local(box.hi)}, entryOf(value, box.lo), places);
+        }
+        table.assemble(std::move(places));
+        return result;
     }
 
     void checkItem(const BakedSuperVoxel& v, const ControlPolynomial& control,
@@ -409,6 +560,7 @@ class SidecarReader {
     const SidecarHeader& header_;
     TrkCheck check_;
     SidecarParts parts_;
+    uint64_t maxMemory_;
     bool hasGradients_;
     std::string prefix_;
     size_t channels_;
@@ -422,7 +574,7 @@ class SidecarReader {
 }  // namespace
 
 Sidecar readSidecar(const std::string& path, const DensitySummary* density, TrkCheck check,
-                    SidecarParts parts) {
+                    SidecarParts parts, uint64_t maxMemory) {
     VdbFile file(path);
     Sidecar sidecar;
     sidecar.header = readHeader(file, density ? &density->grid : nullptr);
@@ -430,7 +582,7 @@ Sidecar readSidecar(const std::string& path, const DensitySummary* density, TrkC
         checkAgainst(sidecar.header, *density, check, path);
     }
     const Int3* anchor = density ? &density->anchor : nullptr;
-    SidecarReader(file, sidecar.header, check, parts).read(anchor, sidecar);
+    SidecarReader(file, sidecar.header, check, parts, maxMemory).read(anchor, sidecar);
     return sidecar;
 }
 

@@ -3,45 +3,20 @@
 
 #include "../failure.h"
 #include "density_types.h"
-#include "guarded_stream.h"
+#include "vdb_tree.h"
+#include "vdb_values.h"
 
-#include <openvdb/io/Archive.h>
-#include <openvdb/io/GridDescriptor.h>
 #include <openvdb/io/io.h>
-#include <sys/stat.h>
 
 #include <algorithm>
-#include <cerrno>
+#include <cmath>
 #include <cstring>
-#include <filesystem>
-#include <istream>
 #include <map>
 #include <sstream>
 #include <utility>
 
 namespace trk {
 namespace {
-
-[[noreturn]] void badFile(const std::string& where, const std::string& what) {
-    throw Error(TRK_ERROR_BAD_FILE, where + ": " + what);
-}
-
-/// Runs a reading step and says in one line what broke it.
-template <class Body>
-auto reading(const std::string& where, const Body& body) {
-    try {
-        return body();
-    } catch (const Error&) {
-        throw;
-    } catch (const std::ios_base::failure&) {
-        badFile(where, "the file ends early; expected more data (truncated or damaged)");
-    } catch (const std::bad_alloc&) {
-        throw Error(TRK_ERROR_OUT_OF_MEMORY,
-                    where + ": asks for more memory than the machine has, or is damaged");
-    } catch (const std::exception& e) {
-        badFile(where, "damaged: " + firstLine(e));
-    }
-}
 
 /// What a file that is not a VDB looks like, from its first bytes.
 std::string guessFormat(const std::string& head) {
@@ -74,213 +49,128 @@ std::string guessFormat(const std::string& head) {
     return "it looks like text";
 }
 
-// Of OpenVDB 13. It added grids of native halfs; all others are as in 224.
+// Of OpenVDB 13. It added grids of native halfs; all others are as in 224. Below 222 nodes are laid
+// out otherwise.
 constexpr uint32_t kNewestVersion = 225;
-constexpr uint32_t kOldestVersion = openvdb::OPENVDB_FILE_VERSION_BOOST_UUID;
-constexpr uint32_t kMaxName = 1u << 16;
+constexpr uint32_t kOldestVersion = 222;
+constexpr int64_t kMagic = 0x56444220;
+constexpr size_t kUuidBytes = 36;
+constexpr size_t kMaxName = size_t{1} << 16;
+
+/// Bytes of a map of OpenVDB's, by its name; 0 for a name that is not known.
+size_t mapBytes(const std::string& type) {
+    static const std::map<std::string, size_t> kBytes = {{"AffineMap", 128},
+                                                         {"UnitaryMap", 128},
+                                                         {"ScaleMap", 120},
+                                                         {"UniformScaleMap", 120},
+                                                         {"TranslationMap", 24},
+                                                         {"ScaleTranslateMap", 144},
+                                                         {"UniformScaleTranslateMap", 144}};
+    const auto it = kBytes.find(type);
+    return it == kBytes.end() ? 0 : it->second;
+}
+
+/// Lets OpenVDB make a transform of the bytes of one.
+openvdb::math::Transform::Ptr transformOf(const std::string& bytes) {
+    std::istringstream stream(bytes, std::ios::binary);
+    openvdb::io::setCurrentVersion(stream);
+    openvdb::math::Transform::Ptr transform(new openvdb::math::Transform);
+    transform->read(stream);
+    return transform;
+}
+
+openvdb::math::Transform::Ptr readTransform(FileReader& reader) {
+    std::ostringstream copy(std::ios::binary);
+    const auto copyBytes = [&](size_t count) {
+        std::string bytes(count, '\0');
+        reader.read(bytes.data(), count);
+        copy << bytes;
+    };
+    std::string type = reader.text(kMaxName, "the name of a map");
+    openvdb::writeString(copy, type);
+    if (type == "NonlinearFrustumMap") {  // a box, a taper, a depth and a map of its own
+        copyBytes(64);
+        type = reader.text(kMaxName, "the name of a map");
+        openvdb::writeString(copy, type);
+    }
+    const size_t bytes = mapBytes(type);
+    if (bytes == 0) {
+        reader.refuse("a transform of unknown kind \"" + type + "\"");
+    }
+    copyBytes(bytes);
+    try {
+        return transformOf(copy.str());
+    } catch (const openvdb::Exception& e) {  // OpenVDB's own limit: a determinant below 3e-15
+        throw Error(TRK_ERROR_UNSUPPORTED_GRID,
+                    reader.place() + ": has a transform that OpenVDB refuses: " + firstLine(e));
+    }
+}
 
 }  // namespace
 
-/// Gives access to the reading steps that OpenVDB keeps for its own file classes. The stream throws
-/// on every short read.
-class VdbFile::Archive : public openvdb::io::Archive {
-  public:
-    explicit Archive(const std::string& path) {
-        std::error_code error;
-        if (std::filesystem::is_directory(path, error)) {
-            throw Error(TRK_ERROR_IO, path + ": is a directory; expected a .vdb file");
+void VdbMetadata::read(FileReader& reader) {
+    constexpr size_t kMaxItems = 1000;
+    const auto isWanted = [](const std::string& name) {
+        return name.rfind("track_", 0) == 0 || name.rfind("file_", 0) == 0 || name == "class" ||
+               name == "creator" || name == "is_saved_as_half_float";
+    };
+    items_.clear();
+    const auto count = reader.value<uint32_t>();
+    for (uint32_t i = 0; i < count; ++i) {
+        const std::string name = reader.text(kMaxName, "a name of metadata");
+        Item item;
+        item.type = reader.text(kMaxName, "a type of metadata");
+        const auto bytes = reader.value<uint32_t>();
+        reader.expect(bytes, "metadata");
+        if (!isWanted(name) || bytes > kMaxName || items_.size() == kMaxItems) {
+            reader.skip(bytes);
+            continue;
         }
-        errno = 0;
-        if (!buffer_.open(path, std::ios::in | std::ios::binary)) {
-            throw Error(TRK_ERROR_IO, path + ": cannot be opened: " + std::strerror(errno));
-        }
+        item.bytes.resize(bytes);
+        reader.read(item.bytes.data(), bytes);
+        items_[name] = std::move(item);
     }
+}
 
-    void readHead(const std::string& path, uint64_t bytes, VdbFileHeader& header,
-                  std::vector<VdbEntry>& entries) {
-        header.version = checkMagic(path);
-        stream_.exceptions(std::ios::badbit | std::ios::failbit | std::ios::eofbit);
-        readHeader(stream_);
-        tagStream(false);
-        openvdb::MetaMap fileMetadata;
-        fileMetadata.readMeta(stream_);
-        header.writtenBy =
-            std::to_string(libraryVersion().first) + "." + std::to_string(libraryVersion().second);
-        if (const auto creator = fileMetadata.getMetadata<openvdb::StringMetadata>("creator")) {
-            header.creator = creator->value();
-        }
-        const int32_t count = readGridCount(stream_);
-        if (count < 0) {
-            badFile(path, "damaged: lists " + std::to_string(count) + " grids");
-        }
-        for (int32_t i = 0; i < count; ++i) {
-            VdbEntry entry = readEntry();
-            if (inputHasGridOffsets()) {
-                int64_t offsets[3];  // grid, blocks, end
-                stream_.read(reinterpret_cast<char*>(offsets), sizeof(offsets));
-                // Each entry must lie behind the last, or a damaged directory could go round for
-                // ever.
-                if (offsets[0] < static_cast<int64_t>(stream_.tellg()) || offsets[2] < offsets[0]) {
-                    badFile(path, "damaged: grid " + entry.name + " ends before it begins");
-                }
-                if (static_cast<uint64_t>(offsets[2]) > bytes) {
-                    badFile(path, "the file ends early, before grid " + entry.name +
-                                      " does (truncated or damaged)");
-                }
-                entry.position = offsets[0];
-                stream_.seekg(offsets[0]);
-                tagStream(entry.half);
-                readGridCompression(stream_);
-                entry.compression = openvdb::io::getDataCompression(stream_);
-                stream_.seekg(offsets[2]);
-            } else {
-                int64_t offsets[3];
-                stream_.read(reinterpret_cast<char*>(offsets), sizeof(offsets));
-                entry.position = static_cast<int64_t>(stream_.tellg());
-                entry.loaded = readGrid(entry, true, 0, path);
-                entry.compression = openvdb::io::getDataCompression(stream_);
-                if (!entry.loaded) {
-                    badFile(path, "grid " + entry.name + " of unknown type " + entry.type +
-                                      " in a file without offsets, which cannot be skipped");
-                }
-            }
-            entries.push_back(std::move(entry));
-        }
+template <class T>
+std::optional<T> VdbMetadata::value(const std::string& name, const char* type) const {
+    const auto it = items_.find(name);
+    if (it == items_.end() || it->second.type != type || it->second.bytes.size() != sizeof(T)) {
+        return std::nullopt;
     }
+    T result;
+    std::memcpy(&result, it->second.bytes.data(), sizeof(T));
+    return result;
+}
 
-    openvdb::GridBase::Ptr readGrid(const VdbEntry& entry, bool withVoxels, uint64_t maxBytes,
-                                    const std::string& path) {
-        if (!openvdb::GridBase::isRegistered(entry.type)) {
-            return nullptr;
-        }
-        openvdb::GridBase::Ptr grid = openvdb::GridBase::createGrid(entry.type);
-        grid->setSaveFloatAsHalf(entry.half);
-        stream_.clear();
-        stream_.seekg(entry.position);
-        tagStream(entry.half);
-        readGridCompression(stream_);
-        guard(entry);
-        openvdb::io::setGridClass(stream_, openvdb::GRID_UNKNOWN);
-        openvdb::io::setGridBackgroundValuePtr(stream_, nullptr);
-        grid->readMeta(stream_);
-        metadata_->gridMetadata() = static_cast<openvdb::MetaMap&>(*grid);
-        openvdb::io::setGridClass(stream_, grid->getGridClass());
-        grid->readTransform(stream_);
-        if (!withVoxels || !entry.parent.empty()) {
-            return grid;
-        }
-        grid->readTopology(stream_);
-        const uint64_t leafBytes =
-            grid->constBaseTree().leafCount() * 512 * valueBytes(valueTypeName(entry.type));
-        if (maxBytes > 0 && leafBytes > maxBytes) {
-            throw Error(
-                TRK_ERROR_OUT_OF_MEMORY,
-                path + ": grid " + entry.label() + " needs " + std::to_string(leafBytes) +
-                    " bytes for its voxels, more than maxMemory = " + std::to_string(maxBytes));
-        }
-        grid->readBuffers(stream_);
-        return grid;
-    }
+std::optional<std::string> VdbMetadata::text(const std::string& name) const {
+    const auto it = items_.find(name);
+    return it == items_.end() || it->second.type != "string" ? std::nullopt
+                                                             : std::optional(it->second.bytes);
+}
+std::optional<int32_t> VdbMetadata::int32(const std::string& name) const {
+    return value<int32_t>(name, "int32");
+}
+std::optional<int64_t> VdbMetadata::int64(const std::string& name) const {
+    return value<int64_t>(name, "int64");
+}
+std::optional<double> VdbMetadata::real(const std::string& name) const {
+    return value<double>(name, "double");
+}
+std::optional<Vec3d> VdbMetadata::vec3d(const std::string& name) const {
+    return value<Vec3d>(name, "vec3d");
+}
+std::optional<std::array<int32_t, 3>> VdbMetadata::vec3i(const std::string& name) const {
+    return value<std::array<int32_t, 3>>(name, "vec3i");
+}
+bool VdbMetadata::flag(const std::string& name) const {
+    return value<uint8_t>(name, "bool").value_or(0) != 0;
+}
 
-  private:
-    /// The file's version, which this build reads.
-    uint32_t checkMagic(const std::string& path) {
-        std::string head(20, '\0');
-        stream_.read(head.data(), static_cast<std::streamsize>(head.size()));
-        head.resize(static_cast<size_t>(stream_.gcount()));
-        if (stream_.bad()) {
-            throw Error(TRK_ERROR_IO, path + ": cannot be read: " + std::strerror(errno));
-        }
-        const int64_t magic = openvdb::OPENVDB_MAGIC;
-        if (head.size() < sizeof(magic) || std::memcmp(head.data(), &magic, sizeof(magic)) != 0) {
-            badFile(path, "not a VDB file: " + guessFormat(head));
-        }
-        uint32_t version = 0;
-        if (head.size() >= sizeof(magic) + sizeof(version)) {
-            std::memcpy(&version, head.data() + sizeof(magic), sizeof(version));
-        }
-        // OpenVDB only warns of a newer version than its own, then parses on.
-        if (version > kNewestVersion) {
-            uint32_t writer[2] = {0, 0};
-            std::memcpy(writer, head.data() + sizeof(magic) + sizeof(version),
-                        std::min(sizeof(writer), head.size() - sizeof(magic) - sizeof(version)));
-            badFile(path, "VDB file version " + std::to_string(version) + ", written by OpenVDB " +
-                              std::to_string(writer[0]) + "." + std::to_string(writer[1]) +
-                              "; this build reads up to " + std::to_string(kNewestVersion) +
-                              " (OpenVDB 13); save it with an older OpenVDB");
-        }
-        if (version > openvdb::OPENVDB_FILE_VERSION) {
-            buffer_.showVersion(openvdb::OPENVDB_FILE_VERSION);
-        }
-        if (version < kOldestVersion) {
-            badFile(path, "VDB file version " + std::to_string(version) + "; expected at least " +
-                              std::to_string(kOldestVersion));
-        }
-        stream_.clear();
-        stream_.seekg(0);
-        return version;
-    }
-
-    /// Attaches fresh stream metadata, which OpenVDB's reading steps consult and change per grid.
-    void tagStream(bool half) {
-        metadata_ = std::make_shared<openvdb::io::StreamMetadata>();
-        metadata_->setHalfFloat(half);
-        openvdb::io::setStreamMetadataPtr(stream_, metadata_, /*transfer=*/false);
-        setFormatVersion(stream_);
-        setLibraryVersion(stream_);
-        setDataCompression(stream_);
-    }
-
-    std::string readName() {
-        uint32_t size = 0;
-        stream_.read(reinterpret_cast<char*>(&size), sizeof(size));
-        if (size > kMaxName) {
-            throw std::runtime_error("a grid name of " + std::to_string(size) + " bytes");
-        }
-        std::string name(size, '\0');
-        stream_.read(name.data(), static_cast<std::streamsize>(size));
-        return name;
-    }
-
-    VdbEntry readEntry() {
-        static const std::string kHalfSuffix = "_HalfFloat";
-        VdbEntry entry;
-        entry.uniqueName = readName();
-        entry.name = openvdb::io::GridDescriptor::stripSuffix(entry.uniqueName);
-        entry.type = readName();
-        if (entry.type.size() > kHalfSuffix.size() &&
-            entry.type.compare(entry.type.size() - kHalfSuffix.size(), std::string::npos,
-                               kHalfSuffix) == 0) {
-            entry.half = true;
-            entry.type.resize(entry.type.size() - kHalfSuffix.size());
-        }
-        entry.parent = readName();
-        return entry;
-    }
-
-    /// Has the stream watch over the chunks of a grid, where it knows what they look like.
-    void guard(const VdbEntry& entry) {
-        using Codec = GuardedFileBuf::Codec;
-        const std::string valueType = valueTypeName(entry.type);
-        const auto channels = static_cast<size_t>(channelCount(valueType));
-        const uint32_t flags = openvdb::io::getDataCompression(stream_);
-        Codec codec = flags & openvdb::io::COMPRESS_BLOSC ? Codec::kBlosc
-                      : flags & openvdb::io::COMPRESS_ZIP ? Codec::kZip
-                                                          : Codec::kUnguarded;
-        if (fileVersion() < openvdb::OPENVDB_FILE_VERSION_NODE_MASK_COMPRESSION || channels == 0) {
-            codec = Codec::kUnguarded;
-        }
-        GuardedFileBuf::Values values;
-        values.half = entry.half;
-        values.size = entry.half ? 2 * channels : valueBytes(valueType);
-        values.mayBeEightBytes = valueType == "double";
-        buffer_.beginGrid(codec, values, (flags & openvdb::io::COMPRESS_ACTIVE_MASK) != 0);
-    }
-
-    GuardedFileBuf buffer_;
-    std::istream stream_{&buffer_};
-    openvdb::io::StreamMetadata::Ptr metadata_;
-};
+std::string VdbGridHeader::gridClass() const {
+    return openvdb::GridBase::gridClassToString(
+        openvdb::GridBase::stringToGridClass(metadata.text("class").value_or("")));
+}
 
 std::string VdbEntry::rawLabel() const {
     return name.empty() || equalNames > 1 ? name + "[" + std::to_string(index) + "]" : name;
@@ -295,21 +185,16 @@ std::string VdbEntry::label() const {
 }
 
 std::string VdbEntry::compressionName() const {
-    const std::string codec = compression & openvdb::io::COMPRESS_BLOSC ? "blosc"
-                              : compression & openvdb::io::COMPRESS_ZIP ? "zip"
-                                                                        : "none";
-    return compression & openvdb::io::COMPRESS_ACTIVE_MASK ? codec + ", active values only" : codec;
+    const std::string codec = compression & kVdbBlosc ? "blosc"
+                              : compression & kVdbZip ? "zip"
+                                                      : "none";
+    return compression & kVdbActiveMask ? codec + ", active values only" : codec;
 }
 
-VdbFile::VdbFile(const std::string& path) : path_(path) {
+VdbFile::VdbFile(const std::string& path) : reader_(path) {
     openvdb::initialize();
-    archive_ = std::make_unique<Archive>(path);
-    struct stat info = {};
-    if (stat(path.c_str(), &info) == 0) {
-        bytes_ = static_cast<uint64_t>(info.st_size);
-        modified_ = int64_t{info.st_mtim.tv_sec} * 1000000000 + info.st_mtim.tv_nsec;
-    }
-    reading(path, [&] { archive_->readHead(path, bytes_, header_, entries_); });
+    readMagic();
+    readDirectory();
     std::map<std::string, int> counts;
     for (VdbEntry& entry : entries_) {
         entry.index = counts[entry.name]++;
@@ -317,34 +202,132 @@ VdbFile::VdbFile(const std::string& path) : path_(path) {
     for (VdbEntry& entry : entries_) {
         entry.equalNames = counts[entry.name];
     }
+    reader_.setPlace(path);
 }
 
-VdbFile::~VdbFile() = default;
-
-openvdb::GridBase::Ptr VdbFile::readMetadata(const VdbEntry& entry) {
-    if (entry.loaded) {
-        return entry.loaded;
+void VdbFile::readMagic() {
+    std::string head(20, '\0');
+    head.resize(static_cast<size_t>(std::min<uint64_t>(head.size(), reader_.bytes())));
+    reader_.read(head.data(), head.size());
+    if (head.size() < sizeof(kMagic) || std::memcmp(head.data(), &kMagic, sizeof(kMagic)) != 0) {
+        throw Error(TRK_ERROR_BAD_FILE, path() + ": not a VDB file: " + guessFormat(head));
     }
-    return reading(path_ + ": grid " + entry.label(),
-                   [&] { return archive_->readGrid(entry, false, 0, path_); });
+    reader_.confine(sizeof(kMagic), reader_.bytes());
+    header_.version = reader_.value<uint32_t>();
+    const auto major = std::to_string(reader_.value<uint32_t>());
+    header_.writtenBy = major + "." + std::to_string(reader_.value<uint32_t>());
+    if (header_.version < kOldestVersion || header_.version > kNewestVersion) {
+        throw Error(TRK_ERROR_BAD_FILE,
+                    path() + ": VDB file version " + std::to_string(header_.version) +
+                        ", written by OpenVDB " + header_.writtenBy + "; this build reads " +
+                        std::to_string(kOldestVersion) + " to " + std::to_string(kNewestVersion) +
+                        " (OpenVDB 13); save it with " +
+                        (header_.version > kNewestVersion ? "an older" : "a newer") + " OpenVDB");
+    }
 }
 
-openvdb::GridBase::Ptr VdbFile::read(const VdbEntry& entry, uint64_t maxBytes) {
-    const std::string where = path_ + ": grid " + entry.label();
-    openvdb::GridBase::Ptr grid = entry.loaded;
-    if (!grid) {
-        grid = reading(where, [&] { return archive_->readGrid(entry, true, maxBytes, path_); });
+void VdbFile::readDirectory() {
+    const auto hasOffsets = reader_.value<uint8_t>();
+    if (hasOffsets > 1) {
+        reader_.refuse("a header whose flag of offsets is " + std::to_string(hasOffsets));
     }
-    if (!grid || entry.parent.empty()) {
-        return grid;
+    hasOffsets_ = hasOffsets == 1;
+    reader_.skip(kUuidBytes);
+    VdbMetadata metadata;
+    metadata.read(reader_);
+    header_.creator = metadata.text("creator").value_or("");
+    const auto count = reader_.value<int32_t>();
+    if (count < 0) {
+        reader_.refuse("lists " + std::to_string(count) + " grids");
+    }
+    const uint64_t fileEnd = reader_.bytes();
+    for (int32_t i = 0; i < count; ++i) {
+        reader_.setPlace(path());
+        VdbEntry entry = readEntry();
+        const auto offsets = reader_.value<std::array<uint64_t, 3>>();
+        const std::string name = path() + ": grid " + entry.label();
+        reader_.setPlace(name);
+        if (hasOffsets_) {
+            // Each entry must lie behind the last, or a damaged directory could go round for ever.
+            // One that shares a tree has no values of its own.
+            const uint64_t blocks = entry.parent.empty() ? offsets[1] : offsets[0];
+            if (offsets[0] < reader_.position() || blocks < offsets[0] || offsets[2] < blocks) {
+                reader_.refuse("its entry in the directory says that it ends before it begins");
+            }
+            entry.position = offsets[0];
+            entry.blocks = entry.parent.empty() ? offsets[1] : 0;
+            entry.end = offsets[2];
+            reader_.confine(entry.position, entry.end);
+            readCompression(entry);
+        } else {
+            entry.position = reader_.position();
+            entry.end = fileEnd;
+            readCompression(entry);
+            reader_.confine(readHeader(entry).tree, fileEnd);
+            if (entry.parent.empty() &&
+                !stepOverTree(reader_, entry.type, entry.half, entry.compression)) {
+                reader_.refuse("is of type " + entry.type +
+                               " in a file without offsets, where it cannot be stepped over; save "
+                               "it as a file, not a stream");
+            }
+            entry.end = reader_.position();
+        }
+        reader_.confine(entry.end, fileEnd);
+        entries_.push_back(std::move(entry));
+    }
+}
+
+VdbEntry VdbFile::readEntry() {
+    static const std::string kHalfSuffix = "_HalfFloat";
+    constexpr char kSeparator = '\x1e';  // between a name and what makes it unique
+    VdbEntry entry;
+    entry.uniqueName = reader_.text(kMaxName, "a grid's name");
+    entry.name = entry.uniqueName.substr(0, entry.uniqueName.find(kSeparator));
+    entry.type = reader_.text(kMaxName, "a grid's type");
+    if (entry.type.size() > kHalfSuffix.size() &&
+        entry.type.compare(entry.type.size() - kHalfSuffix.size(), std::string::npos,
+                           kHalfSuffix) == 0) {
+        entry.half = true;
+        entry.type.resize(entry.type.size() - kHalfSuffix.size());
+    }
+    entry.parent = reader_.text(kMaxName, "a grid's name");
+    return entry;
+}
+
+void VdbFile::readCompression(VdbEntry& entry) {
+    entry.compression = reader_.value<uint32_t>();
+    if ((entry.compression & ~kVdbKnownCompression) != 0) {
+        reader_.refuse("compressed in way " + std::to_string(entry.compression) +
+                       "; this build knows zip (1), active values only (2) and blosc (4)");
+    }
+}
+
+VdbGridHeader VdbFile::readHeader(const VdbEntry& entry) {
+    reader_.setPlace(path() + ": grid " + entry.label());
+    reader_.confine(entry.position + sizeof(uint32_t), entry.end);
+    VdbGridHeader header;
+    header.metadata.read(reader_);
+    if (header.metadata.flag("is_saved_as_half_float") != entry.half) {
+        reader_.refuse(entry.half ? "its type says that values are halfs, its metadata does not"
+                                  : "its metadata says that values are halfs, its type does not");
+    }
+    header.transform = readTransform(reader_);
+    header.tree = reader_.position();
+    return header;
+}
+
+const VdbEntry& VdbFile::treeOwner(const VdbEntry& entry) const {
+    if (entry.parent.empty()) {
+        return entry;
     }
     for (const VdbEntry& other : entries_) {
         if (other.uniqueName == entry.parent && other.parent.empty() && other.type == entry.type) {
-            grid->setTree(read(other, maxBytes)->baseTreePtr());
-            return grid;
+            return other;
         }
     }
-    badFile(where, "damaged: it shares the voxels of a grid that is not in the file");
+    throw Error(TRK_ERROR_BAD_FILE,
+                path() + ": grid " + entry.label() +
+                    ": damaged: it shares the voxels of a grid that is not in the file");
 }
 
 const VdbEntry& VdbFile::select(const std::string& selector) const {
@@ -362,7 +345,7 @@ const VdbEntry& VdbFile::select(const std::string& selector) const {
         return *found;
     }
     throw Error(TRK_ERROR_GRID_NOT_FOUND,
-                path_ +
+                path() +
                     (matches == 0 ? ": no grid \"" + selector + "\""
                                   : ": " + std::to_string(matches) + " grids named \"" + selector +
                                         "\"; choose one by its index") +
@@ -430,13 +413,10 @@ openvdb::math::Transform::Ptr makeTransform(const AffineMap& map) {
     }
     // Every constructor of a Transform finds the scale of a map without rotation as the difference
     // of two points, and loses it where the translation is large. Reading one takes it as it is.
-    std::stringstream stream(std::ios::in | std::ios::out | std::ios::binary);
-    openvdb::io::setCurrentVersion(stream);
-    openvdb::writeString(stream, base->type());
-    base->write(stream);
-    openvdb::math::Transform::Ptr transform(new openvdb::math::Transform);
-    transform->read(stream);
-    return transform;
+    std::ostringstream bytes(std::ios::binary);
+    openvdb::writeString(bytes, base->type());
+    base->write(bytes);
+    return transformOf(bytes.str());
 }
 
 }  // namespace trk

@@ -252,8 +252,10 @@ class SparseTable {
         return result;
     }
 
-    /// The entry at a point: an item, a tile, or, with `minShift`, the node of at least that size.
-    Found find(int64_t x, int64_t y, int64_t z, int minShift = 0) const {
+    /// The entry at a point: an item, a tile, or, with `minShift`, the node that is the first of at
+    /// most that size on the way (`step` 1), or the last of at least that size (kWhole).
+    static constexpr int kWhole = 3;
+    Found find(int64_t x, int64_t y, int64_t z, int minShift = 0, int step = 1) const {
         const uint64_t rx = static_cast<uint64_t>((x >> rootShift_) - rootLo_[0]);
         const uint64_t ry = static_cast<uint64_t>((y >> rootShift_) - rootLo_[1]);
         const uint64_t rz = static_cast<uint64_t>((z >> rootShift_) - rootLo_[2]);
@@ -264,7 +266,7 @@ class SparseTable {
         }
         Entry entry = root_[(rx * ny + ry) * nz + rz];
         int shift = rootShift_;
-        while ((entry & kNodeFlag) && shift > minShift) {
+        while ((entry & kNodeFlag) && shift >= minShift + step) {
             shift -= 3;
             entry = child(entry, childIndex(x >> shift, y >> shift, z >> shift));
         }
@@ -353,26 +355,30 @@ class SparseTable {
         return count;
     }
 
-    /// The one entry that stands for everywhere in the region of 2^shift voxels at `origin`, if
-    /// any. Items that fill the region count too.
+    /// The one entry that stands for everywhere in the region of 2^shift voxels at `origin`,
+    /// aligned to its size, if any. Items that fill the region count too.
     std::optional<Entry> uniformEntry(const Int3& origin, int shift) const {
         if (root_.empty()) {
             return kEmpty;
         }
-        const Found found = find(origin[0], origin[1], origin[2]);
-        if (found.shift >= shift) {
-            return found.entry;
+        const int64_t size = int64_t{1} << shift;
+        const IntBox region{origin, {{origin[0] + size, origin[1] + size, origin[2] + size}}};
+        if (shift <= rootShift_) {
+            const Found found = find(origin[0], origin[1], origin[2], shift, kWhole);
+            return uniformIn(found.entry, found.shift, region);
         }
-        const int64_t half = int64_t{1} << (shift - 1);
-        for (int64_t octant = 0; octant < 8; ++octant) {
-            const Int3 part{{origin[0] + (octant >> 2) * half, origin[1] + (octant >> 1 & 1) * half,
-                             origin[2] + (octant & 1) * half}};
-            const auto entry = uniformEntry(part, shift - 1);
-            if (!entry || *entry != found.entry) {
-                return std::nullopt;
-            }
+        bool outside = false;
+        for (size_t a = 0; a < 3; ++a) {
+            outside = outside || region.lo[a] < rootLo_[a] << rootShift_ ||
+                      region.hi[a] > (rootLo_[a] + rootSize_[a]) << rootShift_;
         }
-        return found.entry;
+        std::optional<Entry> all = outside ? std::optional<Entry>(kEmpty) : std::nullopt;
+        bool same = true;
+        forEachRootRegion(region, [&](size_t i, const Int3&) {
+            same = same && (root_[i] & kNodeFlag) == 0 && (!all || *all == root_[i]);
+            all = root_[i];
+        });
+        return same ? all : std::nullopt;
     }
 
     /// The parts, eight an axis, of a region of 2^shift voxels at `origin`.
@@ -657,12 +663,32 @@ class SparseTable {
         return entry;
     }
 
+    /// As uniformEntry, of a region in or of an entry of 2^shift voxels, which is a node only where
+    /// its children are smaller than the region.
+    std::optional<Entry> uniformIn(Entry entry, int shift, const IntBox& region) const {
+        if ((entry & kNodeFlag) == 0) {
+            return entry;
+        }
+        std::optional<Entry> all;
+        bool same = true;
+        const Int3 lo{{region.lo[0] >> shift << shift, region.lo[1] >> shift << shift,
+                       region.lo[2] >> shift << shift}};
+        forEachChild(region, lo, shift, [&](size_t c, const Int3&) {
+            const Entry e = child(entry, c);
+            same = same && (e & kNodeFlag) == 0 && (!all || *all == e);
+            all = e;
+        });
+        return same ? all : std::nullopt;
+    }
+
     template <class EntryOf>
     Entry derive(const SparseTable& source, const Corners& corners, int shift, EntryOf& entryOf,
                  std::unordered_map<Key, Entry, KeyHash>& memo) {
         Entry all = kEmpty;
+        bool sparse = true;
         for (const Entry e : corners) {
             all |= e;
+            sparse = sparse && (e == kEmpty || ((e & kNodeFlag) && (e & kLinkFlag)));
         }
         if (all == kEmpty) {
             return kEmpty;
@@ -678,9 +704,35 @@ class SparseTable {
             return it->second;
         }
         // The parts' entries, nine an axis: the last of each is the upper neighbour's.
-        std::array<Entry, 729> parts;
+        std::array<Entry, 729> parts{};
+        Parts occupied;  // children that anything is at a corner of, where that is known
+        const auto childFrom = [&](size_t c) {
+            const Entry* at = &parts[(c >> 6) * 81 + (c >> 3 & 7) * 9 + (c & 7)];
+            return derive(source, {at[0], at[1], at[9], at[10], at[81], at[82], at[90], at[91]},
+                          shift - 3, entryOf, memo);
+        };
         for (size_t c = 0; c < 8; ++c) {
+            if (corners[c] == kEmpty) {
+                continue;
+            }
             const size_t first = (c & 4 ? 8 * 81 : 0) + (c & 2 ? 8 * 9 : 0) + (c & 1 ? 8 : 0);
+            if (sparse) {
+                const Link& link = source.links_[corners[c] & kIndexMask];
+                const size_t at[3] = {link.child >> 6, link.child >> 3 & 7, link.child & 7};
+                if ((c & 4 && at[0] > 0) || (c & 2 && at[1] > 0) || (c & 1 && at[2] > 0)) {
+                    continue;
+                }
+                parts[first + at[0] * 81 + at[1] * 9 + at[2]] = link.entry;
+                for (size_t k = 0; k < 8; ++k) {  // whose corner it is
+                    const size_t x = at[0] + (c & 4 ? 8 : 0) - (k >> 2);
+                    const size_t y = at[1] + (c & 2 ? 8 : 0) - (k >> 1 & 1);
+                    const size_t z = at[2] + (c & 1 ? 8 : 0) - (k & 1);
+                    if (x < 8 && y < 8 && z < 8) {
+                        occupied.set(x << 6 | y << 3 | z);
+                    }
+                }
+                continue;
+            }
             for (size_t x = 0; x < (c & 4 ? 1u : 8u); ++x) {
                 for (size_t y = 0; y < (c & 2 ? 1u : 8u); ++y) {
                     for (size_t z = 0; z < (c & 1 ? 1u : 8u); ++z) {
@@ -691,11 +743,11 @@ class SparseTable {
                 }
             }
         }
-        Node node;
+        Node node{};
         for (size_t c = 0; c < node.size(); ++c) {
-            const Entry* at = &parts[(c >> 6) * 81 + (c >> 3 & 7) * 9 + (c & 7)];
-            node[c] = derive(source, {at[0], at[1], at[9], at[10], at[81], at[82], at[90], at[91]},
-                             shift - 3, entryOf, memo);
+            if (!sparse || occupied[c]) {
+                node[c] = childFrom(c);
+            }
         }
         const Entry entry = addNode(node);
         memo.emplace(std::move(key), entry);

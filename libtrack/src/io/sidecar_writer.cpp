@@ -1,4 +1,5 @@
 // SPDX-License-Identifier: Apache-2.0
+#include "../parallel.h"
 #include "density_types.h"
 #include "sidecar.h"
 #include "sidecar_schema.h"
@@ -7,8 +8,10 @@
 
 #include <openvdb/tools/Prune.h>
 
+#include <array>
 #include <functional>
 #include <string>
+#include <utility>
 #include <vector>
 
 namespace trk {
@@ -63,25 +66,6 @@ Int3 gridIndex(const Int3& local, const Int3& toGrid, int itemShift) {
              (toGrid[2] + local[2]) >> itemShift}};
 }
 
-/// Sets the value of every occupied item and tile, active.
-template <class GridType>
-void fillItems(GridType& grid, const SparseTable& table, const Int3& toGrid,
-               const ValuesOf& valuesOf) {
-    using Value = typename GridType::ValueType;
-    auto accessor = grid.getAccessor();
-    const int itemShift = table.itemShift();
-    table.forEach([&](const Int3& lo, int shift, SparseTable::Entry entry) {
-        const openvdb::Coord at = toCoord(gridIndex(lo, toGrid, itemShift));
-        const auto value = fromFloats<Value>(valuesOf(SparseTable::index(entry)));
-        if (shift == itemShift) {
-            accessor.setValueOn(at, value);
-            return;
-        }
-        const int32_t size = 1 << (shift - itemShift);
-        grid.sparseFill(openvdb::CoordBBox::createCube(at, size), value, true);
-    });
-}
-
 /// Sets the corner values of every occupied item and tile that are not 0; neighbours agree.
 template <class GridType>
 void fillCorners(GridType& grid, const BakedVolume& baked, const Int3& toGrid) {
@@ -112,34 +96,88 @@ void fillCorners(GridType& grid, const BakedVolume& baked, const Int3& toGrid) {
     });
 }
 
-/// What all grids of one sidecar share.
-struct SidecarGrids {
-    const SidecarHeader& header;
-    Int3 toGrid;
+/// Writes the grids of one sidecar.
+class SidecarGrids {
+  public:
+    SidecarGrids(VdbWriter& writer, const SidecarHeader& header, const Int3& toGrid)
+        : writer_(writer), header_(header), toGrid_(toGrid) {}
 
-    /// A grid of super-voxels of `size`, filled by `fill(typed grid)`.
-    template <class Fill>
-    openvdb::GridBase::Ptr make(const std::string& valueType, const std::string& suffix, int size,
-                                double offset, const Fill& fill) const {
+    /// A grid without voxels.
+    openvdb::GridBase::Ptr describe(const std::string& valueType, const std::string& suffix,
+                                    int size, double offset) const {
         openvdb::GridBase::Ptr grid = openvdb::GridBase::createGrid(treeTypeName(valueType));
-        grid->apply<DensityGrids>([&](auto& typed) {
-            fill(typed);
-            openvdb::tools::prune(typed.tree());
-        });
-        grid->setName(gridPrefix(header.prefix) + suffix);
+        grid->setName(gridPrefix(header_.prefix) + suffix);
         grid->setGridClass(openvdb::GRID_FOG_VOLUME);
         grid->setTransform(
-            makeTransform(superVoxelMap(header.indexToWorld, header.origin, size, offset)));
-        addMetadata(*grid, header);
+            makeTransform(superVoxelMap(header_.indexToWorld, header_.origin, size, offset)));
+        addMetadata(*grid, header_);
         return grid;
     }
-    /// A grid of values per super-voxel.
-    openvdb::GridBase::Ptr makeItems(const std::string& valueType, const std::string& suffix,
-                                     const SparseTable& table, const ValuesOf& valuesOf) const {
+
+    /// A grid of values per super-voxel, which is made and written by the next flush().
+    void add(const std::string& valueType, const std::string& suffix, const SparseTable& table,
+             size_t items, ValuesOf valuesOf, bool isSigned = false) {
         const int size = 1 << table.itemShift();
-        return make(valueType, suffix, size, centreOffset(size),
-                    [&](auto& grid) { fillItems(grid, table, toGrid, valuesOf); });
+        Pending pending;
+        pending.grid = describe(valueType, suffix, size, centreOffset(size));
+        if (isSigned) {
+            pending.grid->setGridClass(openvdb::GRID_UNKNOWN);  // no density
+        }
+        pending.valueType = valueType;
+        pending.table = &table;
+        pending.items = items;
+        pending.valuesOf = std::move(valuesOf);
+        pending_.push_back(std::move(pending));
     }
+
+    /// Writes what was added, in its order; several grids are made at once where they are small.
+    void flush() {
+        constexpr size_t kSmallRoots = 64;  // a grid's masks take 9 kB for each
+        for (size_t first = 0; first < pending_.size();) {
+            // Grids of one table lie one after another and share its layout.
+            const SparseTable* table = pending_[first].table;
+            size_t last = first;
+            while (last < pending_.size() && pending_[last].table == table) {
+                ++last;
+            }
+            const TreeLayout layout(*table, toGrid_);
+            const size_t step = layout.roots() <= kSmallRoots ? last - first : 1;
+            for (; first < last; first += step) {
+                std::vector<EncodedTree> trees(step);
+                parallelFor(step, 1,
+                            [&](size_t i) { trees[i] = encode(pending_[first + i], layout); });
+                for (size_t i = 0; i < step; ++i) {
+                    writer_.add(pending_[first + i].grid, trees[i]);
+                }
+            }
+        }
+        pending_.clear();
+    }
+
+  private:
+    struct Pending {
+        openvdb::GridBase::Ptr grid;
+        std::string valueType;
+        const SparseTable* table = nullptr;
+        size_t items = 0;
+        ValuesOf valuesOf;
+    };
+
+    static EncodedTree encode(const Pending& pending, const TreeLayout& layout) {
+        return withValueType(pending.valueType, [&](auto zero) {
+            using Value = decltype(zero);
+            std::vector<Value> values(pending.items);
+            for (size_t i = 0; i < pending.items; ++i) {
+                values[i] = fromFloats<Value>(pending.valuesOf(i));
+            }
+            return encodeTree(layout, values);
+        });
+    }
+
+    VdbWriter& writer_;
+    const SidecarHeader& header_;
+    Int3 toGrid_;
+    std::vector<Pending> pending_;
 };
 
 }  // namespace
@@ -166,38 +204,43 @@ void writeSidecar(const OutputFile& file, SidecarHeader header, const BakedVolum
     for (size_t a = 0; a < 3; ++a) {
         toGrid[a] = anchor[a] - header.origin[a];
     }
-    const SidecarGrids grids{header, toGrid};
+    SidecarGrids grids(writer, header, toGrid);
     if (corners > 0) {
-        writer.add(grids.make(header.valueType, kControlSuffix, baked.superVoxelSize(), 0,
-                              [&](auto& grid) { fillCorners(grid, baked, toGrid); }));
-    }
-    std::vector<float> values(channels);
-    for (const Statistic& statistic : list) {
-        writer.add(grids.makeItems(header.valueType, statistic.suffix, baked.table, [&](size_t i) {
-            for (size_t c = 0; c < channels; ++c) {
-                values[c] = baked.items[i * channels + c].*statistic.value;
-            }
-            return values.data();
-        }));
-    }
-    for (size_t c = 0; c < gradients.size(); ++c) {
-        const auto grid =
-            grids.makeItems(vectorType(header.valueType), gradients[c], baked.table,
-                            [&](size_t i) { return &baked.gradients[3 * (i * channels + c)]; });
-        grid->setGridClass(openvdb::GRID_UNKNOWN);  // signed: no density
+        const openvdb::GridBase::Ptr grid =
+            grids.describe(header.valueType, kControlSuffix, baked.superVoxelSize(), 0);
+        grid->apply<DensityGrids>([&](auto& typed) {
+            fillCorners(typed, baked, toGrid);
+            openvdb::tools::prune(typed.tree());
+        });
         writer.add(grid);
     }
+    const size_t items = baked.items.size() / channels;
+    for (const Statistic& statistic : list) {
+        grids.add(header.valueType, statistic.suffix, baked.table, items,
+                  [&baked, statistic, channels, values = std::array<float, 3>{}](size_t i) mutable {
+                      for (size_t c = 0; c < channels; ++c) {
+                          values[c] = baked.items[i * channels + c].*statistic.value;
+                      }
+                      return values.data();
+                  });
+    }
+    for (size_t c = 0; c < gradients.size(); ++c) {
+        grids.add(
+            vectorType(header.valueType), gradients[c], baked.table, items,
+            [&baked, channels, c](size_t i) { return &baked.gradients[3 * (i * channels + c)]; },
+            /*isSigned=*/true);
+    }
+    const auto addMeans = [&](const std::string& suffix, const ValueTable& means) {
+        grids.add(header.valueType, suffix, means.table, means.values.size() / channels,
+                  [&means, channels](size_t i) { return &means.values[i * channels]; });
+    };
     for (size_t level = 1; level <= baked.levels.size(); ++level) {
-        const ValueTable& means = baked.levels[level - 1];
-        writer.add(grids.makeItems(header.valueType, levelSuffix(static_cast<int>(level)),
-                                   means.table,
-                                   [&](size_t i) { return &means.values[i * channels]; }));
+        addMeans(levelSuffix(static_cast<int>(level)), baked.levels[level - 1]);
     }
     if (previews > 0) {
-        writer.add(grids.makeItems(header.valueType, previewSuffix(baked.previewSize),
-                                   baked.preview.table,
-                                   [&](size_t i) { return &baked.preview.values[i * channels]; }));
+        addMeans(previewSuffix(baked.previewSize), baked.preview);
     }
+    grids.flush();
     writer.finish();
 }
 

@@ -33,9 +33,44 @@ class VdbWriter::Archive : public openvdb::io::Archive {
         writeGrid(descriptor, grid, stream_, /*seekable=*/true);
         openvdb::io::setDataCompression(stream_, compression());
     }
+    void add(const openvdb::GridBase::Ptr& grid, const EncodedTree& tree) {
+        openvdb::io::GridDescriptor descriptor(grid->getName(), grid->type());
+        descriptor.writeHeader(stream_);
+        const auto offsets = stream_.tellp();
+        descriptor.writeStreamPos(stream_);  // once more when they are known
+        descriptor.setGridPos(stream_.tellp());
+        const uint32_t compression = kEncodedCompression;
+        stream_.write(reinterpret_cast<const char*>(&compression), sizeof(compression));
+
+        const openvdb::CoordBBox box = tree.activeVoxels > 0 ? tree.box : openvdb::CoordBBox();
+        const auto number = [](uint64_t x) {
+            return openvdb::Int64Metadata(static_cast<int64_t>(x));
+        };
+        grid->insertMeta(openvdb::GridBase::META_FILE_BBOX_MIN,
+                         openvdb::Vec3IMetadata(box.min().asVec3i()));
+        grid->insertMeta(openvdb::GridBase::META_FILE_BBOX_MAX,
+                         openvdb::Vec3IMetadata(box.max().asVec3i()));
+        grid->insertMeta(openvdb::GridBase::META_FILE_VOXEL_COUNT, number(tree.activeVoxels));
+        grid->insertMeta(openvdb::GridBase::META_FILE_MEM_BYTES, number(tree.openvdbBytes));
+        grid->insertMeta(openvdb::GridBase::META_FILE_COMPRESSION,
+                         openvdb::StringMetadata(openvdb::io::compressionToString(compression)));
+        grid->writeMeta(stream_);
+        grid->writeTransform(stream_);
+        write(tree.topology);
+        descriptor.setBlockPos(stream_.tellp());
+        write(tree.buffers);
+        descriptor.setEndPos(stream_.tellp());
+        stream_.seekp(offsets);
+        descriptor.writeStreamPos(stream_);
+        descriptor.seekToEnd(stream_);
+    }
     void finish() { stream_.close(); }
 
   private:
+    void write(const std::string& bytes) {
+        stream_.write(bytes.data(), static_cast<std::streamsize>(bytes.size()));
+    }
+
     std::ofstream stream_;
 };
 
@@ -60,6 +95,10 @@ VdbWriter::~VdbWriter() = default;
 
 void VdbWriter::add(const openvdb::GridBase::Ptr& grid) {
     writing([&] { archive_->add(grid); });
+}
+
+void VdbWriter::add(const openvdb::GridBase::Ptr& grid, const EncodedTree& tree) {
+    writing([&] { archive_->add(grid, tree); });
 }
 
 void VdbWriter::finish() {

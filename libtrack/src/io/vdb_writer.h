@@ -5,6 +5,7 @@
 
 #include "openvdb_grids.h"
 #include "output_file.h"
+#include "tree_encoder.h"
 
 #include <cstdint>
 #include <memory>
@@ -21,6 +22,8 @@ class VdbWriter {
     VdbWriter& operator=(const VdbWriter&) = delete;
 
     void add(const openvdb::GridBase::Ptr& grid);
+    /// A grid whose tree was encoded; `grid` has none, and gets metadata that tells of this one.
+    void add(const openvdb::GridBase::Ptr& grid, const EncodedTree& tree);
     /// To be called after the last grid: what was written may still wait in buffers.
     void finish();
 

@@ -1,0 +1,56 @@
+// SPDX-License-Identifier: Apache-2.0
+// The tree of a grid as a .vdb file stores it, made from a sparse table without a tree in memory:
+// work and memory go with what is occupied, where OpenVDB takes 300 kB for a single voxel.
+#pragma once
+
+#include "../sparse_table.h"
+#include "openvdb_grids.h"
+
+#include <cstdint>
+#include <string>
+#include <vector>
+
+namespace trk {
+
+/// Where the items and tiles of a table lie in a grid of one voxel an item, as the nodes of a tree
+/// hold them, in their order.
+class TreeLayout {
+  public:
+    /// `toGrid`: from the table's space to the corner that the grid counts from.
+    TreeLayout(const SparseTable& table, const Int3& toGrid);
+
+    struct Piece {
+        uint64_t root;    ///< which node of 4096^3, in order
+        uint64_t within;  ///< slots in it, in the node of 128^3 below, and in the leaf
+        int shift;        ///< 0, 3, 7 or 12: a voxel, or a tile
+        SparseTable::Entry entry;
+    };
+    const std::vector<Piece>& pieces() const { return pieces_; }
+    size_t roots() const { return roots_; }
+
+  private:
+    void add(const IntBox& box, int shift, SparseTable::Entry entry);
+    void add(const Int3& lo, int shift, SparseTable::Entry entry);
+
+    std::vector<Piece> pieces_;
+    size_t roots_ = 0;
+};
+
+/// What lies between a grid's transform and its end.
+struct EncodedTree {
+    std::string topology;
+    std::string buffers;
+    uint64_t activeVoxels = 0;
+    openvdb::CoordBBox box;  ///< of active voxels
+    uint64_t openvdbBytes = 0;
+};
+
+/// A tree of active values over a background of 0, compressed with Blosc, active values only;
+/// what is alike is a tile. `values`: of the table's items, by SparseTable::index of their entry.
+template <class Value>
+EncodedTree encodeTree(const TreeLayout& layout, const std::vector<Value>& values);
+
+/// The compression of an encoded tree, OpenVDB's COMPRESS_… bits.
+constexpr uint32_t kEncodedCompression = 6;
+
+}  // namespace trk

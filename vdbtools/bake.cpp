@@ -132,9 +132,10 @@ class Baker {
                 return known;
             },
             [&](const Int3& origin) { return addJob(origin) | single; },
-            // The surface of a large tile repeats a handful of patterns of bricks.
+            // The surface of a large tile repeats a handful of patterns of bricks. Nodes alone are
+            // looked for: of a lone super-voxel that costs more than to bake it.
             [&](const Int3& origin, int shift, SparseTable::Key& key) {
-                return field_.table().appendKey(origin, shift, key);
+                return shift > shift_ && field_.table().appendKey(origin, shift, key);
             });
     }
 
@@ -399,28 +400,36 @@ class Baker {
         double majorant = 0;
         double squares = 0;
         const auto edge = static_cast<size_t>(cube_);
+        constexpr size_t kEdge = ExtinctionField::kBrickEdge;
         forEachCube(origin, [&](const Int3& offset, Entry entry, const Int3& inBrick) {
-            const bool constant = ExtinctionField::isConstant(entry);
             const auto unit = [&](size_t axis, size_t i) {
                 return (static_cast<double>(offset[axis]) + static_cast<double>(i)) / size_ - 0.5;
             };
+            std::array<double, kEdge> row{};
+            if (ExtinctionField::isConstant(entry)) {
+                row.fill(static_cast<double>(field_.constant(entry)[channel]));
+            }
             for (size_t x = 0; x <= edge; ++x) {
                 for (size_t y = 0; y <= edge; ++y) {
-                    for (size_t z = 0; z <= edge; ++z) {
-                        const size_t vertex =
-                            ((static_cast<size_t>(inBrick[0]) + x) * ExtinctionField::kBrickEdge +
-                             static_cast<size_t>(inBrick[1]) + y) *
-                                ExtinctionField::kBrickEdge +
-                            static_cast<size_t>(inBrick[2]) + z;
-                        const float density = constant ? field_.constant(entry)[channel]
-                                                       : field_.vertex(entry, vertex, channel);
-                        const double residual = static_cast<double>(density) -
-                                                control.at({{unit(0, x), unit(1, y), unit(2, z)}});
-                        const double weight =
-                            trapezoid(x, edge) * trapezoid(y, edge) * trapezoid(z, edge);
-                        majorant = std::max(majorant, std::fabs(residual));
-                        squares += weight * residual * residual;
+                    const size_t first = ((static_cast<size_t>(inBrick[0]) + x) * kEdge +
+                                          static_cast<size_t>(inBrick[1]) + y) *
+                                             kEdge +
+                                         static_cast<size_t>(inBrick[2]);
+                    for (size_t z = 0; z <= edge && !ExtinctionField::isConstant(entry); ++z) {
+                        row[z] = static_cast<double>(field_.vertex(entry, first + z, channel));
                     }
+                    // Linear along a row, whatever the kind.
+                    const double ux = unit(0, x);
+                    const double uy = unit(1, y);
+                    const double start = control.at({{ux, uy, unit(2, 0)}});
+                    const double step = control.slopeZ(ux, uy) / size_;
+                    double sum = 0;
+                    for (size_t z = 0; z <= edge; ++z) {
+                        const double residual = row[z] - (start + step * static_cast<double>(z));
+                        majorant = std::max(majorant, std::fabs(residual));
+                        sum += trapezoid(z, edge) * residual * residual;
+                    }
+                    squares += trapezoid(x, edge) * trapezoid(y, edge) * sum;
                 }
             }
         });

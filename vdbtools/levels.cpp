@@ -1,14 +1,18 @@
 // SPDX-License-Identifier: Apache-2.0
 #include "levels.h"
 
+#include "hash.h"
 #include "moments.h"
+#include "parallel.h"
 
 #include <algorithm>
 #include <array>
 #include <cmath>
 #include <cstddef>
+#include <cstring>
 #include <map>
 #include <optional>
+#include <unordered_map>
 #include <utility>
 
 namespace vdbtools {
@@ -28,7 +32,12 @@ ValueTable nextLevel(const SparseTable& finer, const trk::IntBox& box, size_t ch
     const int64_t half = int64_t{1} << finer.itemShift();
     level.table = SparseTable(shift, box);
     using Mean = std::array<float, 3>;
-    std::map<Mean, SparseTable::Entry> known;
+    const auto hash = [](const Mean& mean) {
+        uint64_t words[2] = {0, 0};
+        std::memcpy(words, mean.data(), sizeof(mean));
+        return trk::hashWords(words, 2, 0);
+    };
+    std::unordered_map<Mean, SparseTable::Entry, decltype(hash)> known(64, hash);
     const auto add = [&](const Mean& mean) {
         if (mean == Mean{}) {
             return SparseTable::kEmpty;
@@ -73,7 +82,7 @@ ValueTable nextLevel(const SparseTable& finer, const trk::IntBox& box, size_t ch
             return add(mean);
         },
         [&](const Int3& origin, int regionShift, SparseTable::Key& key) {
-            return finer.appendKey(origin, regionShift, key);
+            return regionShift > shift && finer.appendKey(origin, regionShift, key);
         });
     return level;
 }
@@ -88,6 +97,24 @@ ValueTable meansOf(const ExtinctionField& field, int shift) {
     }
     const size_t channels = field.channels();
     const auto edge = static_cast<size_t>(1) << shift;
+    const size_t perAxis = 8 / edge;
+    const size_t cubes = perAxis * perAxis * perAxis;
+    std::vector<float> brickMeans(field.brickCount() * cubes * channels);
+    trk::parallelFor(field.brickCount(), 32, [&](size_t b) {
+        float vertices[ExtinctionField::kBrickVertices];
+        for (size_t c = 0; c < channels; ++c) {
+            for (size_t i = 0; i < ExtinctionField::kBrickVertices; ++i) {
+                vertices[i] = field.vertex(static_cast<SparseTable::Entry>(b + 1), i, c);
+            }
+            for (size_t k = 0; k < cubes; ++k) {
+                const BrickChannel brick{BrickChannel{vertices}.row(k / (perAxis * perAxis) * edge,
+                                                                    k / perAxis % perAxis * edge) +
+                                         k % perAxis * edge};
+                brickMeans[(b * cubes + k) * channels + c] =
+                    static_cast<float>(cubeMean(brick, edge));
+            }
+        }
+    });
     ValueTable means;
     means.table = SparseTable(shift, field.box());
     const auto add = [&](const float* values) {
@@ -98,7 +125,6 @@ ValueTable meansOf(const ExtinctionField& field, int shift) {
         return static_cast<SparseTable::Entry>(means.values.size() / channels);
     };
     std::map<SparseTable::Entry, SparseTable::Entry> constants;
-    float vertices[ExtinctionField::kBrickVertices];
     means.table.fill(
         {&field.table()},
         [&](const Int3& origin, int regionShift) -> std::optional<SparseTable::Entry> {
@@ -112,28 +138,12 @@ ValueTable meansOf(const ExtinctionField& field, int shift) {
         },
         [&](const Int3& origin) {
             const auto entry = field.table().find(origin[0], origin[1], origin[2]).entry;
-            float values[3] = {0, 0, 0};
-            for (size_t c = 0; c < channels; ++c) {
-                for (size_t x = 0; x <= edge; ++x) {
-                    for (size_t y = 0; y <= edge; ++y) {
-                        for (size_t z = 0; z <= edge; ++z) {
-                            const size_t at = ((static_cast<size_t>(origin[0] & 7) + x) *
-                                                   ExtinctionField::kBrickEdge +
-                                               static_cast<size_t>(origin[1] & 7) + y) *
-                                                  ExtinctionField::kBrickEdge +
-                                              static_cast<size_t>(origin[2] & 7) + z;
-                            vertices[(x * ExtinctionField::kBrickEdge + y) *
-                                         ExtinctionField::kBrickEdge +
-                                     z] = field.vertex(entry, at, c);
-                        }
-                    }
-                }
-                values[c] = static_cast<float>(cubeMoments(BrickChannel{vertices}, edge).mean);
-            }
-            return add(values);
+            const auto part = [&](size_t a) { return static_cast<size_t>(origin[a] & 7) / edge; };
+            const size_t k = (part(0) * perAxis + part(1)) * perAxis + part(2);
+            return add(&brickMeans[((entry - 1) * cubes + k) * channels]);
         },
         [&](const Int3& origin, int regionShift, SparseTable::Key& key) {
-            return regionShift >= ExtinctionField::kBrickShift &&
+            return regionShift > ExtinctionField::kBrickShift &&
                    field.table().appendKey(origin, regionShift, key);
         });
     return means;

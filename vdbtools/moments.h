@@ -75,26 +75,34 @@ inline CornerMoments cornerMoments(const BrickChannel& brick, size_t size) {
     return corners;
 }
 
-/// Moments of one cube of `size`^3 cells of a brick. Two passes over values that are in L1:
-/// deviations from the mean do not cancel, and a cube of equal values has a mean of that very
-/// value.
-inline Moments cubeMoments(const BrickChannel& brick, size_t size) {
-    const auto weighted = [&](const auto& term) {
-        double sum = 0;
-        for (size_t x = 0; x <= size; ++x) {
-            double plane = 0;
-            for (size_t y = 0; y <= size; ++y) {
-                const float* row = brick.row(x, y);
-                double line = 0.5 * (term(row[0]) + term(row[size]));
-                for (size_t z = 1; z < size; ++z) {
-                    line += term(row[z]);
-                }
-                plane += trapezoid(y, size) * line;
+/// The sum of term(value) over the vertices of a cube of a brick, weighed by their part inside.
+template <class Term>
+double weightedSum(const BrickChannel& brick, size_t size, const Term& term) {
+    double sum = 0;
+    for (size_t x = 0; x <= size; ++x) {
+        double plane = 0;
+        for (size_t y = 0; y <= size; ++y) {
+            const float* row = brick.row(x, y);
+            double line = 0.5 * (term(row[0]) + term(row[size]));
+            for (size_t z = 1; z < size; ++z) {
+                line += term(row[z]);
             }
-            sum += trapezoid(x, size) * plane;
+            plane += trapezoid(y, size) * line;
         }
-        return sum;
-    };
+        sum += trapezoid(x, size) * plane;
+    }
+    return sum;
+}
+
+/// The mean over a cube of `size`^3 cells of a brick; of equal values, that very value.
+inline double cubeMean(const BrickChannel& brick, size_t size) {
+    return weightedSum(brick, size, [](float v) { return static_cast<double>(v); }) /
+           static_cast<double>(size * size * size);
+}
+
+/// Moments of one cube of `size`^3 cells of a brick. Two passes over values that are in L1:
+/// deviations from the mean do not cancel.
+inline Moments cubeMoments(const BrickChannel& brick, size_t size) {
     Moments m;
     m.min = m.max = *brick.first;
     for (size_t x = 0; x <= size; ++x) {
@@ -109,9 +117,8 @@ inline Moments cubeMoments(const BrickChannel& brick, size_t size) {
     if (m.min == m.max) {
         return constantMoments(m.min);
     }
-    m.mean = weighted([](float v) { return static_cast<double>(v); }) /
-             static_cast<double>(size * size * size);
-    m.squares = weighted([&](float v) {
+    m.mean = cubeMean(brick, size);
+    m.squares = weightedSum(brick, size, [&](float v) {
         const double d = static_cast<double>(v) - m.mean;
         return d * d;
     });

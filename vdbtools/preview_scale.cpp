@@ -1,6 +1,8 @@
 // SPDX-License-Identifier: Apache-2.0
 #include "preview_scale.h"
 
+#include "parallel.h"
+
 #include <algorithm>
 #include <array>
 #include <charconv>
@@ -56,7 +58,7 @@ double previewScale(const ExtinctionField& field, const trk::AffineMap& indexToW
     size_t count = 0;
     field.table().forEach([&](const trk::Int3&, int, trk::SparseTable::Entry) { ++count; });
     const size_t step = std::max<size_t>(1, count / kPlaces);
-    std::vector<double> depths;
+    std::vector<Vec3d> centres;
     size_t i = 0;
     field.table().forEach([&](const trk::Int3& lo, int shift, trk::SparseTable::Entry) {
         if (i++ % step != step / 2) {
@@ -66,14 +68,15 @@ double previewScale(const ExtinctionField& field, const trk::AffineMap& indexToW
         for (int a = 0; a < 3; ++a) {
             centre[a] = static_cast<double>(lo[static_cast<size_t>(a)]) + std::ldexp(0.5, shift);
         }
-        for (int axis = 0; axis < 3; ++axis) {
-            const double depth =
-                depthThrough(field, centre, axis, length(indexToWorld.column(axis)));
-            if (depth > 0) {
-                depths.push_back(depth);
-            }
-        }
+        centres.push_back(centre);
     });
+    std::vector<double> depths(3 * centres.size());
+    trk::parallelFor(depths.size(), 16, [&](size_t k) {
+        const int axis = static_cast<int>(k % 3);
+        depths[k] = depthThrough(field, centres[k / 3], axis, length(indexToWorld.column(axis)));
+    });
+    depths.erase(std::remove_if(depths.begin(), depths.end(), [](double d) { return !(d > 0); }),
+                 depths.end());
     if (depths.empty()) {
         return 1;
     }

@@ -102,6 +102,10 @@ struct ControlPolynomial {
     double at(const Vec3d& u) const {
         return centre + evaluateSlope<ControlKind::kTrilinear>(slope.data(), u);
     }
+    /// How it grows along z, in units of u, where x and y are these.
+    double slopeZ(double x, double y) const {
+        return slope[2] + x * slope[4] + y * slope[5] + x * y * slope[6];
+    }
     /// The largest value at a corner, and anywhere in the super-voxel.
     double max() const {
         double result = at({{-0.5, -0.5, -0.5}});

@@ -1,12 +1,15 @@
 // SPDX-License-Identifier: Apache-2.0
 #include "tree_encoder.h"
 
+#include "../parallel.h"
+
 #include <blosc.h>
 
 #include <algorithm>
 #include <array>
 #include <cstring>
 #include <optional>
+#include <utility>
 
 namespace trk {
 namespace {
@@ -78,6 +81,7 @@ class Encoder {
     Encoder(const std::vector<Value>& values, EncodedTree& out) : values_(values), out_(out) {}
 
     void encode(const std::vector<Piece>& pieces) {
+        encodeLeaves(pieces);
         uint32_t tiles = 0;
         uint32_t children = 0;
         std::string tileBytes;
@@ -181,36 +185,67 @@ class Encoder {
         return tile;
     }
     std::optional<Value> encodeLower(const Piece* begin, const Piece* end, std::string& out) {
-        const auto tile = encodeNode(begin, end, 4, kLowerAt, 3, out,
-                                     [&](const Piece* first, const Piece* last, std::string& to) {
-                                         return encodeLeaf(first, last, to);
-                                     });
+        const auto tile =
+            encodeNode(begin, end, 4, kLowerAt, 3, out,
+                       [&](const Piece*, const Piece*, std::string& to) { return encodeLeaf(to); });
         using Upper = typename openvdb::tree::Tree4<Value, 5, 4, 3>::Type::RootNodeType;
         out_.openvdbBytes += tile ? 0 : sizeof(typename Upper::ChildNodeType::ChildNodeType);
         return tile;
     }
-    std::optional<Value> encodeLeaf(const Piece* begin, const Piece* end, std::string& out) {
+    struct Leaf {
+        const Piece* begin = nullptr;
+        const Piece* end = nullptr;
         std::array<uint64_t, 8> mask{};
-        std::vector<Value> active;
-        bool same = true;
-        for (const Piece* p = begin; p != end; ++p) {
-            const uint64_t i = p->within & 511;
-            mask[i >> 6] |= uint64_t{1} << (i & 63);
-            active.push_back(valueOf(*p));
-            same = same && active.back() == active.front();
+        bool isTile = false;
+        std::string values;
+    };
+
+    /// All leaves, in parallel: compressing them takes most of the time.
+    void encodeLeaves(const std::vector<Piece>& pieces) {
+        forEachGroup(
+            pieces.data(), pieces.data() + pieces.size(),
+            [](const Piece& p) { return std::make_pair(p.root, p.within >> kLowerAt); },
+            [&](const Piece* begin, const Piece* end) {
+                if (begin->shift == 0) {
+                    Leaf& leaf = leaves_.emplace_back();
+                    leaf.begin = begin;
+                    leaf.end = end;
+                }
+            });
+        parallelFor(leaves_.size(), 16, [&](size_t i) {
+            Leaf& leaf = leaves_[i];
+            std::vector<Value> active;
+            bool same = true;
+            for (const Piece* p = leaf.begin; p != leaf.end; ++p) {
+                const uint64_t at = p->within & 511;
+                leaf.mask[at >> 6] |= uint64_t{1} << (at & 63);
+                active.push_back(valueOf(*p));
+                same = same && active.back() == active.front();
+            }
+            leaf.isTile = same && active.size() == 512;
+            if (!leaf.isTile) {
+                putValues(leaf.values, active);
+            }
+        });
+    }
+
+    /// The next of them.
+    std::optional<Value> encodeLeaf(std::string& out) {
+        const Leaf& leaf = leaves_[nextLeaf_++];
+        if (leaf.isTile) {
+            return valueOf(*leaf.begin);
         }
-        if (same && active.size() == 512) {
-            return active[0];
-        }
-        put(out, mask);
-        put(out_.buffers, mask);
-        putValues(out_.buffers, active);
+        put(out, leaf.mask);
+        put(out_.buffers, leaf.mask);
+        out_.buffers += leaf.values;
         out_.openvdbBytes += 512 * sizeof(Value) + 96;
         return std::nullopt;
     }
 
     const std::vector<Value>& values_;
     EncodedTree& out_;
+    std::vector<Leaf> leaves_;
+    size_t nextLeaf_ = 0;
 };
 
 }  // namespace

@@ -66,7 +66,7 @@ PackedValues takeValues(FileReader& file, const ValueFormat& format, size_t slot
     const auto take = [&](size_t count) {
         const size_t at = bytes.size();
         bytes.resize(at + count);
-        file.read(&bytes[at], count);
+        file.read(bytes.data() + at, count);
     };
     take(head);
     if (format.half && packed.count == 0) {  // no halfs, no chunk; no floats, an empty one

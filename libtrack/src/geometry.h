@@ -52,6 +52,11 @@ struct IntBox {
             hi[a] = first ? boxHi[a] : std::max(hi[a], boxHi[a]);
         }
     }
+    void add(const IntBox& box) {
+        if (!box.empty()) {
+            add(box.lo, box.hi);
+        }
+    }
 };
 
 /// The smallest float that is not below `value`; the largest one where `value` exceeds all.

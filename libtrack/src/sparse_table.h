@@ -338,20 +338,21 @@ class SparseTable {
 
     /// Box around everything occupied.
     IntBox occupiedBox() const {
+        std::unordered_map<Entry, Extent> known;
         IntBox box;
-        forEach([&](const Int3& lo, int shift, Entry) {
-            const int64_t size = int64_t{1} << shift;
-            box.add(lo, {{lo[0] + size, lo[1] + size, lo[2] + size}});
+        forEachRootRegion([&](size_t i, const Int3& origin) {
+            box.add(moved(extentOf(root_[i], rootShift_, known).box, origin));
         });
         return box;
     }
 
     /// How many items are occupied, tiles counted as the items they stand for.
     uint64_t occupiedItems() const {
+        std::unordered_map<Entry, Extent> known;
         uint64_t count = 0;
-        forEach([&](const Int3&, int shift, Entry) {
-            count += uint64_t{1} << 3 * (shift - itemShift_);
-        });
+        for (const Entry entry : root_) {
+            count += extentOf(entry, rootShift_, known).items;
+        }
         return count;
     }
 
@@ -447,6 +448,50 @@ class SparseTable {
         static_assert(sizeof(word) == sizeof(link));
         std::memcpy(&word, &link, sizeof(word));
         return addKnown(hashWords(&word, 1, 1), links_, link, kNodeFlag | kLinkFlag);
+    }
+
+    /// What of a region is occupied: a box, counted from its origin, and items. Of nodes that are
+    /// met more than once, found once.
+    struct Extent {
+        IntBox box;
+        uint64_t items = 0;
+    };
+    static IntBox moved(IntBox box, const Int3& by) {
+        for (size_t a = 0; a < 3 && !box.empty(); ++a) {
+            box.lo[a] += by[a];
+            box.hi[a] += by[a];
+        }
+        return box;
+    }
+    Extent extentOf(Entry entry, int shift, std::unordered_map<Entry, Extent>& known) const {
+        Extent extent;
+        if (entry == kEmpty) {
+            return extent;
+        }
+        if ((entry & kNodeFlag) == 0) {
+            const int64_t size = int64_t{1} << shift;
+            extent.box.add({{0, 0, 0}}, {{size, size, size}});
+            extent.items = uint64_t{1} << 3 * (shift - itemShift_);
+            return extent;
+        }
+        if (const auto it = known.find(entry); it != known.end()) {
+            return it->second;
+        }
+        const auto add = [&](size_t c, Entry e) {
+            const Extent part = extentOf(e, shift - 3, known);
+            extent.box.add(moved(part.box, childOrigin({{0, 0, 0}}, shift - 3, c)));
+            extent.items += part.items;
+        };
+        if (entry & kLinkFlag) {
+            const Link& link = links_[entry & kIndexMask];
+            add(link.child, link.entry);
+        } else {
+            for (size_t c = 0; c < 512; ++c) {
+                add(c, nodes_[entry & kIndexMask][c]);
+            }
+        }
+        known.emplace(entry, extent);
+        return extent;
     }
 
     /// Gives back what only filling needs.

@@ -169,6 +169,62 @@ TEST(SparseTable, CrossesAHugeGapInAFewSteps) {
     EXPECT_NEAR(met[0].t1 - met[0].t0, 8 * std::sqrt(3.0), 1e-6);
 }
 
+/// Work and memory per lone item, of `count` that lie scattered over 2^31 voxels an axis.
+struct Effort {
+    double asked;  // questions that a derived table asks
+    double given;  // regions of the table made from it by corners
+    double bytes;
+};
+Effort effortOf(size_t count) {
+    constexpr int64_t kWide = int64_t{1} << 31;
+    std::mt19937_64 random(5);
+    std::vector<SparseTable::Place> places;
+    for (size_t i = 0; i < count; ++i) {
+        Int3 lo;
+        for (int64_t& x : lo) {
+            x = static_cast<int64_t>(random() % kWide) & ~int64_t{7};
+        }
+        places.push_back({lo, 3, static_cast<SparseTable::Entry>(i + 1)});
+    }
+    SparseTable table(3, cube(kWide));
+    table.assemble(places);
+    for (const auto& place : places) {
+        EXPECT_EQ(table.find(place.lo[0], place.lo[1], place.lo[2]).entry, place.entry);
+    }
+    EXPECT_EQ(table.occupiedItems(), count);
+    const auto n = static_cast<double>(count);
+    Effort effort{0, 0, static_cast<double>(table.bytes()) / n};
+    SparseTable coarse(4, cube(kWide));
+    coarse.fill(
+        {&table},
+        [&](const Int3& at, int shift) {
+            ++effort.asked;
+            const auto entry = table.uniformEntry(at, shift);
+            return entry && *entry == SparseTable::kEmpty ? entry : std::nullopt;
+        },
+        [](const Int3&) { return 7u; });
+    EXPECT_EQ(coarse.occupiedItems(), count);
+    SparseTable neighbours(3, cube(kWide));
+    neighbours.fillFrom(table, [&](const SparseTable::Corners& corners, int) {
+        ++effort.given;
+        return std::optional(corners[0]);
+    });
+    EXPECT_EQ(neighbours.occupiedItems(), count);
+    effort.asked /= n;
+    effort.given /= n;
+    return effort;
+}
+
+TEST(SparseTable, WorkGoesWithContentHoweverScattered) {
+    for (const size_t count : {100u, 1000u, 10000u, 100000u}) {
+        const Effort effort = effortOf(count);
+        // Of each level of the tree a few, and 32^3 regions of the root.
+        EXPECT_LT(effort.asked, 50 + 70000.0 / static_cast<double>(count)) << count;
+        EXPECT_LT(effort.given, 100) << count;
+        EXPECT_LT(effort.bytes, 200 + 140000.0 / static_cast<double>(count) + 2100) << count;
+    }
+}
+
 TEST(SparseTable, MappingCollapsesWhatBecameUniform) {
     const SparseTable table = randomTable(64);
     const SparseTable collapsed =

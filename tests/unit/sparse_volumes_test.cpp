@@ -9,7 +9,9 @@
 
 #include <cmath>
 #include <cstdio>
+#include <filesystem>
 #include <fstream>
+#include <random>
 #include <string>
 
 namespace {
@@ -114,6 +116,57 @@ TEST(SparseVolumes, AnOpenedCloudStaysNearItsGridInMemory) {
     if (!fixtures::kSanitized) {
         EXPECT_LT(resident, 1.7 * static_cast<double>(gridBytes));
     }
+}
+
+TEST(SparseVolumes, AThousandScatteredVoxels) {
+    openvdb::initialize();
+    size_t bytes[2];
+    const int counts[2] = {100, 1000};
+    for (int i = 0; i < 2; ++i) {
+        auto grid = openvdb::FloatGrid::create();
+        grid->setName("density");
+        std::mt19937 random(7);
+        std::uniform_int_distribution<int> place(-1000000000, 1000000000);
+        for (int k = 0; k < counts[i]; ++k) {
+            grid->tree().setValueOn(openvdb::Coord(place(random), place(random), place(random)),
+                                    0.5f + 1e-4f * static_cast<float>(k));
+        }
+        const std::string vdb = fixtures::write("scattered.vdb", {grid});
+        grid.reset();
+        const std::string sidecar = fixtures::path("scattered.track.vdb");
+        const trk::Density density = fixtures::load(vdb);
+        bytes[i] = density.field.bytes();
+        fixtures::bake(vdb, sidecar, 16, 4);
+        // Each of its grids has masks of 9 kB a region of 4096^3, as the density's file has.
+        EXPECT_LT(std::filesystem::file_size(sidecar), 11 * std::filesystem::file_size(vdb));
+        const trk::Sidecar read = trk::readSidecar(sidecar, &density.summary, TRK_CHECK_FULL);
+        const vdbtools::VerifyReport report = vdbtools::verify(density.summary, read);
+        EXPECT_TRUE(report.holds) << report.counterexample;
+        EXPECT_LT(report.vertices, 2u * 4913u * static_cast<unsigned>(counts[i]));
+    }
+    EXPECT_LT(bytes[1], 10000u * 1000u);
+    EXPECT_LT(bytes[1], 10.5 * static_cast<double>(bytes[0]));
+}
+
+TEST(SparseVolumes, EqualTilesAreOne) {
+    openvdb::initialize();
+    auto grid = openvdb::FloatGrid::create();
+    grid->setName("density");
+    for (int i = 0; i < 32 * 32 * 32; ++i) {
+        grid->tree().addTile(
+            2, openvdb::Coord(128 * (i >> 10), 128 * (i >> 5 & 31), 128 * (i & 31)), 0.01f, true);
+    }
+    const std::string vdb = fixtures::write("equaltiles.vdb", {grid});
+    const std::string sidecar = fixtures::path("equaltiles.track.vdb");
+    const trk::Density density = fixtures::load(vdb);
+    EXPECT_LT(density.field.bytes(), 1000000u);
+    EXPECT_LT(density.field.brickCount(), 30u);
+    fixtures::bake(vdb, sidecar, 16);
+    const trk::Sidecar read = trk::readSidecar(sidecar, &density.summary, TRK_CHECK_FULL);
+    EXPECT_LT(read.baked.items.size(), 30u);
+    const vdbtools::VerifyReport report = vdbtools::verify(density.summary, read);
+    EXPECT_TRUE(report.holds) << report.counterexample;
+    EXPECT_LT(report.vertices, 1000000u);
 }
 
 TEST(SparseVolumes, ALargeTileIsProvedToo) {

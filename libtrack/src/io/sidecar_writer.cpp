@@ -1,5 +1,4 @@
 // SPDX-License-Identifier: Apache-2.0
-#include "../parallel.h"
 #include "density_types.h"
 #include "sidecar.h"
 #include "sidecar_schema.h"
@@ -130,25 +129,14 @@ class SidecarGrids {
         pending_.push_back(std::move(pending));
     }
 
-    /// Writes what was added, in its order; several grids are made at once where they are small.
+    /// Writes what was added, in its order, one grid in memory at a time.
     void flush() {
-        constexpr size_t kSmallRoots = 64;  // a grid's masks take 9 kB for each
-        for (size_t first = 0; first < pending_.size();) {
+        for (size_t i = 0; i < pending_.size();) {
             // Grids of one table lie one after another and share its layout.
-            const SparseTable* table = pending_[first].table;
-            size_t last = first;
-            while (last < pending_.size() && pending_[last].table == table) {
-                ++last;
-            }
+            const SparseTable* table = pending_[i].table;
             const TreeLayout layout(*table, toGrid_);
-            const size_t step = layout.roots() <= kSmallRoots ? last - first : 1;
-            for (; first < last; first += step) {
-                std::vector<EncodedTree> trees(step);
-                parallelFor(step, 1,
-                            [&](size_t i) { trees[i] = encode(pending_[first + i], layout); });
-                for (size_t i = 0; i < step; ++i) {
-                    writer_.add(pending_[first + i].grid, trees[i]);
-                }
+            for (; i < pending_.size() && pending_[i].table == table; ++i) {
+                writer_.add(pending_[i].grid, encode(pending_[i], layout));
             }
         }
         pending_.clear();

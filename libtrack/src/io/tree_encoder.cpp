@@ -116,8 +116,9 @@ class Encoder {
             const int32_t edge = 1 << piece.shift;
             const openvdb::Coord lo(static_cast<int32_t>(o[0]), static_cast<int32_t>(o[1]),
                                     static_cast<int32_t>(o[2]));
-            out_.box.expand(openvdb::CoordBBox(lo, lo.offsetBy(edge - 1)));
-            out_.activeVoxels += uint64_t{1} << 3 * piece.shift;
+            const openvdb::Coord last = lo.offsetBy(edge - 1);
+            out_.box.expand(openvdb::CoordBBox(lo, last.offsetBy(0, 0, piece.run - 1)));
+            out_.activeVoxels += static_cast<uint64_t>(piece.run) << 3 * piece.shift;
         }
     }
 
@@ -218,13 +219,14 @@ class Encoder {
             bool same = true;
             for (const Piece* p = leaf.begin; p != leaf.end; ++p) {
                 const uint64_t at = p->within & 511;
-                leaf.mask[at >> 6] |= uint64_t{1} << (at & 63);
-                active.push_back(valueOf(*p));
+                leaf.mask[at >> 6] |= ((uint64_t{1} << p->run) - 1) << (at & 63);
+                active.insert(active.end(), static_cast<size_t>(p->run), valueOf(*p));
                 same = same && active.back() == active.front();
             }
             leaf.isTile = same && active.size() == 512;
             if (!leaf.isTile) {
                 putValues(leaf.values, active);
+                leaf.values.shrink_to_fit();  // it was as long as what it was made of
             }
         });
     }
@@ -297,9 +299,18 @@ void TreeLayout::add(const Int3& lo, int shift, SparseTable::Entry entry) {
     for (const int64_t x : lo) {
         root = root << kRootBits | static_cast<uint64_t>((x >> 12) + (1 << (kRootBits - 1)));
     }
-    pieces_.push_back({root,
-                       slot(lo, 7, 5) << kUpperAt | slot(lo, 3, 4) << kLowerAt | slot(lo, 0, 3),
-                       shift, entry});
+    const uint64_t within =
+        slot(lo, 7, 5) << kUpperAt | slot(lo, 3, 4) << kLowerAt | slot(lo, 0, 3);
+    // The surface of a tile is leaves of rows that are alike.
+    if (shift == 0 && !pieces_.empty() && (within & 7) != 0) {
+        Piece& last = pieces_.back();
+        if (last.shift == 0 && last.root == root && last.entry == entry &&
+            last.within + static_cast<uint64_t>(last.run) == within) {
+            ++last.run;
+            return;
+        }
+    }
+    pieces_.push_back({root, within, static_cast<int16_t>(shift), 1, entry});
 }
 
 template <class Value>

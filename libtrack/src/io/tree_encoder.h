@@ -22,7 +22,8 @@ class TreeLayout {
     struct Piece {
         uint64_t root;    ///< which node of 4096^3, in order
         uint64_t within;  ///< slots in it, in the node of 128^3 below, and in the leaf
-        int shift;        ///< 0, 3, 7 or 12: a voxel, or a tile
+        int16_t shift;    ///< 0, 3, 7 or 12: voxels, or a tile
+        int16_t run;      ///< of voxels: how many there are in a row along z
         SparseTable::Entry entry;
     };
     const std::vector<Piece>& pieces() const { return pieces_; }

@@ -216,7 +216,7 @@ Effort effortOf(size_t count) {
 }
 
 TEST(SparseTable, WorkGoesWithContentHoweverScattered) {
-    for (const size_t count : {100u, 1000u, 10000u, 100000u}) {
+    for (const size_t count : {100u, 1000u, 10000u}) {
         const Effort effort = effortOf(count);
         // Of each level of the tree a few, and 32^3 regions of the root.
         EXPECT_LT(effort.asked, 50 + 70000.0 / static_cast<double>(count)) << count;

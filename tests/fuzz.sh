@@ -18,7 +18,6 @@ build fuzz fuzz_density fuzz_sidecar
 build release make_corpus
 build/release/tests/make_corpus build/fuzz/corpus
 export ASAN_OPTIONS=allocator_may_return_null=1
-export LSAN_OPTIONS=suppressions=$PWD/tests/lsan.supp:print_suppressions=0
 mkdir -p build/fuzz/found
 for kind in density sidecar; do
     log=build/fuzz/$kind.log

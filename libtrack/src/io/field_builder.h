@@ -15,7 +15,6 @@
 
 #include <algorithm>
 #include <array>
-#include <atomic>
 #include <cmath>
 #include <limits>
 #include <map>
@@ -71,7 +70,7 @@ struct RegionScan {
 template <class Value>
 class FieldBuilder {
   public:
-    /// `maxMemory`: bytes that the field and what building it takes may come to; 0: no limit.
+    /// `maxMemory`: bytes that the bricks may take; 0: no limit.
     FieldBuilder(RegionSource<Value>& source, uint64_t maxMemory, std::string where)
         : source_(source), maxMemory_(maxMemory), where_(std::move(where)) {}
 
@@ -92,12 +91,11 @@ class FieldBuilder {
     /// On an entry of the table of the source's regions: a constant. Else a leaf's index, plus one.
     static constexpr Entry kConstantFlag = ExtinctionField::kConstantFlag;
     using FieldValue = Sample<Value>;
-    /// Entries of a region and of its seven upper neighbours, or their values.
-    using Corners = std::array<Entry, 8>;
+    using Corners = SparseTable::Corners;
 
     struct CornersHash {
-        size_t operator()(const std::pair<int, Corners>& key) const {
-            return hashWords(key.second.data(), 4, static_cast<uint64_t>(key.first));
+        size_t operator()(const Corners& corners) const {
+            return hashWords(corners.data(), corners.size() / 2, 0);
         }
     };
 
@@ -252,7 +250,6 @@ bool FieldBuilder<Value>::tryScan(RawArray<Stored>& values) {
     values.resize(leafCount * kBrickValues);
     leafConstants_.resize(leafCount);
     scan_ = {};
-    std::atomic<bool> exact{true};
     struct Inexact {};
     tbb::spin_mutex lock;
     const auto body = [&](const LeafBatch<Value>& batch) {
@@ -295,6 +292,7 @@ bool FieldBuilder<Value>::tryScan(RawArray<Stored>& values) {
     } catch (const Inexact&) {
         return false;
     }
+    bool exact = true;
     for (const Tile<Value>& tile : source_.tiles()) {
         scanTile(tile, scan_);
         for (const float v : fieldValue(tile.value)) {
@@ -383,8 +381,10 @@ class FieldBuilder<Value>::Bricks {
 
     const std::vector<Brick>& bricks() const { return bricks_; }
     size_t slots() const { return builder_.leafConstants_.size() + added_; }
-    /// Slots of leaves that nothing is in, in rising order.
-    const std::vector<size_t>& unused() const { return unused_; }
+    /// Slots of leaves that were left empty, in rising order, once everything is filled.
+    std::vector<size_t> holes() const {
+        return {unused_.begin() + static_cast<std::ptrdiff_t>(nextUnused_), unused_.end()};
+    }
 
     /// Writes what of a brick is not its own leaf's.
     void complete(const Brick& brick) {
@@ -467,7 +467,7 @@ class FieldBuilder<Value>::Bricks {
         }
         const bool fromLeaves = std::any_of(corners.begin(), corners.end(), isLeaf);
         if (!fromLeaves) {  // alike all over the surface of a tile: built once
-            const auto [it, isNew] = shared_.try_emplace({0, corners}, SparseTable::kEmpty);
+            const auto [it, isNew] = shared_.try_emplace(corners, SparseTable::kEmpty);
             if (isNew) {
                 it->second = newSlot();
                 bricks_.push_back({corners, it->second});
@@ -497,17 +497,10 @@ class FieldBuilder<Value>::Bricks {
         return static_cast<Entry>(builder_.leafConstants_.size() + ++added_);
     }
 
-  public:
-    /// Slots of leaves that were left empty, once everything is filled.
-    std::vector<size_t> holes() const {
-        return {unused_.begin() + static_cast<std::ptrdiff_t>(nextUnused_), unused_.end()};
-    }
-
-  private:
     FieldBuilder& builder_;
     RawArray<Stored>& values_;
     std::vector<Brick> bricks_;
-    std::unordered_map<std::pair<int, Corners>, Entry, CornersHash> shared_;
+    std::unordered_map<Corners, Entry, CornersHash> shared_;
     std::vector<size_t> unused_;  // slots of leaves of one value
     size_t nextUnused_ = 0;
     size_t added_ = 0;
@@ -516,17 +509,10 @@ class FieldBuilder<Value>::Bricks {
 template <class Value>
 template <class Stored>
 ExtinctionField FieldBuilder<Value>::finish(RawArray<Stored>& values, const Int3& anchor) {
-    IntBox box;
-    const auto toLocal = [&](const IntBox& index) {
-        IntBox local;
-        for (size_t a = 0; a < 3; ++a) {
-            local.lo[a] = index.lo[a] - anchor[a];
-            local.hi[a] = index.hi[a] - anchor[a];
-        }
-        return local;
-    };
-    if (!scan_.box.empty()) {
-        box = toLocal(scan_.box);
+    IntBox box = scan_.box;
+    for (size_t a = 0; a < 3; ++a) {
+        box.lo[a] -= anchor[a];
+        box.hi[a] -= anchor[a];
     }
     Bricks<Stored> bricks(*this, values);
     SparseTable table;

@@ -20,11 +20,11 @@ constexpr size_t kWindow = size_t{1} << 18;
 
 FileReader::FileReader(const std::string& path) : path_(path), place_(path) {
     file_ = ::open(path.c_str(), O_RDONLY | O_CLOEXEC | O_NONBLOCK);
-    const int reason = errno;
-    struct stat info = {};
-    if (file_ < 0 || fstat(file_, &info) != 0) {
-        throw Error(TRK_ERROR_IO, path + ": cannot be opened: " + std::strerror(reason));
+    if (file_ < 0) {
+        throw Error(TRK_ERROR_IO, path + ": cannot be opened: " + std::strerror(errno));
     }
+    struct stat info = {};
+    fstat(file_, &info);  // of an open file; what fails is no regular file
     if (!S_ISREG(info.st_mode)) {
         ::close(file_);
         throw Error(TRK_ERROR_IO,

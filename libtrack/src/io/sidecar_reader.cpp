@@ -388,12 +388,12 @@ class SidecarReader {
                               hashWords(leaf.mask.data(), 8, 0));
                 const tbb::spin_mutex::scoped_lock guard(lock);
                 which[batch.first + i] = addLeaf(std::move(leaf), hash, known, grid.leaves);
-            }
-            const uint64_t held = grid.leaves.size() * kLeafVoxels * sizeof(Floats);
-            if (maxMemory_ > 0 && held > maxMemory_) {
-                throw Error(TRK_ERROR_OUT_OF_MEMORY,
-                            place + ": reading it takes more than maxMemory = " +
-                                std::to_string(maxMemory_) + " bytes");
+                const uint64_t held = grid.leaves.size() * kLeafVoxels * sizeof(Floats);
+                if (maxMemory_ > 0 && held > maxMemory_) {
+                    throw Error(TRK_ERROR_OUT_OF_MEMORY,
+                                place + ": reading it takes more than maxMemory = " +
+                                    std::to_string(maxMemory_) + " bytes");
+                }
             }
         });
         for (size_t i = 0; i < which.size(); ++i) {

@@ -112,7 +112,7 @@ VdbTree<Value>::VdbTree(VdbFile& file, const VdbEntry& entry, uint64_t maxMemory
     end_ = owner.end;
     file.reader().setPlace(place_);
     file.reader().confine(header.tree, end_);
-    readRoot(maxMemory);
+    readRoot();
     valuesStart_ = file.reader().position();
     if (owner.blocks != 0 && valuesStart_ != owner.blocks) {
         file.reader().refuse("its topology ends here, but its values are said to begin at byte " +
@@ -159,6 +159,7 @@ void VdbTree<Value>::readUpper(const Origin& origin) {
     FileReader& reader = file_.reader();
     ++upperNodes_;
     readInternal(origin, kUpperLog2, kLowerShift, upper_);
+    checkMemory();
     forEachBit(upper_.children, [&](size_t i) {
         const Origin lower = childOrigin(origin, i, kUpperLog2, kLowerShift);
         ++lowerNodes_;
@@ -169,19 +170,25 @@ void VdbTree<Value>::readUpper(const Origin& origin) {
             this->leafOrigins_.push_back(childOrigin(lower, j, kLowerLog2, kLeafShift));
             maskHashes_.push_back(hashWords(mask, 8, 0));
         });
-        const uint64_t held = this->leafOrigins_.size() * (sizeof(Origin) + sizeof(uint64_t)) +
-                              this->tiles_.size() * sizeof(Tile<Value>);
-        if (maxMemory_ > 0 && held > maxMemory_) {
-            throw Error(TRK_ERROR_OUT_OF_MEMORY,
-                        place_ + ": has more than " + std::to_string(this->leafOrigins_.size()) +
-                            " leaves, whose list alone takes more than maxMemory = " +
-                            std::to_string(maxMemory_) + " bytes");
-        }
+        checkMemory();
     });
 }
 
 template <class Value>
-void VdbTree<Value>::readRoot(uint64_t) {
+void VdbTree<Value>::checkMemory() const {
+    const uint64_t held = this->leafOrigins_.size() * (sizeof(Origin) + sizeof(uint64_t)) +
+                          this->tiles_.size() * sizeof(Tile<Value>);
+    if (maxMemory_ > 0 && held > maxMemory_) {
+        throw Error(TRK_ERROR_OUT_OF_MEMORY,
+                    place_ + ": has more than " + std::to_string(this->leafOrigins_.size()) +
+                        " leaves and " + std::to_string(this->tiles_.size()) +
+                        " tiles, whose list alone takes more than maxMemory = " +
+                        std::to_string(maxMemory_) + " bytes");
+    }
+}
+
+template <class Value>
+void VdbTree<Value>::readRoot() {
     FileReader& reader = file_.reader();
     readBufferCount(reader);
     this->background_ = reader.value<Value>();
@@ -196,6 +203,7 @@ void VdbTree<Value>::readRoot(uint64_t) {
             reader.refuse("a root tile whose state is " + std::to_string(active));
         }
         addTile(origin, kUpperShift, value, active == 1);
+        checkMemory();
     }
     Origin last{};
     for (uint32_t i = 0; i < children; ++i) {

@@ -38,12 +38,12 @@ class VdbTree : public RegionSource<Value> {
         std::vector<Value> values;
     };
 
-    void readTopology(uint64_t maxMemory);
-    void readRoot(uint64_t maxMemory);
+    void readRoot();
     /// A node of 2^(3 log2Dim) slots of 2^childShift voxels each.
     void readInternal(const Origin& origin, int log2Dim, int childShift, Node& node);
     void readUpper(const Origin& origin);
     void addTile(const Origin& origin, int shift, const Value& value, bool active);
+    void checkMemory() const;
 
     VdbFile& file_;
     std::string place_;

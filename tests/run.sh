@@ -1,6 +1,7 @@
 #!/usr/bin/env bash
 # Installs what is missing, builds, and runs all tests: in Release with warnings as errors, then with
-# address and undefined-behaviour sanitizers. tests/run.sh release|dev runs one of the two.
+# address and undefined-behaviour sanitizers; then damages files and fuzzes what reads them, for minutes.
+# tests/run.sh release|dev runs one of the two alone.
 set -euo pipefail
 cd "$(dirname "$0")/.."
 
@@ -41,3 +42,10 @@ check_format
 for preset in ${1:-release dev}; do
     run_preset "$preset"
 done
+if [ $# -eq 0 ]; then
+    echo "== damaged files =="
+    if [ -n "$TRACK_TEST_DATA" ]; then
+        tests/corrupt.sh build/release "$TRACK_TEST_DATA" 5
+    fi
+    tests/fuzz.sh 60
+fi

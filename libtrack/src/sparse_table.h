@@ -252,9 +252,11 @@ class SparseTable {
         return result;
     }
 
-    /// The entry at a point: an item, a tile, or, with `minShift`, the node that is the first of at
-    /// most that size on the way (`step` 1), or the last of at least that size (kWhole).
+    /// As find's `step`: the node found is the last on the way that is as large as 2^minShift.
     static constexpr int kWhole = 3;
+
+    /// The entry at a point: an item, a tile, or, with `minShift`, the first node on the way that
+    /// is not larger than 2^minShift (or see kWhole).
     Found find(int64_t x, int64_t y, int64_t z, int minShift = 0, int step = 1) const {
         const uint64_t rx = static_cast<uint64_t>((x >> rootShift_) - rootLo_[0]);
         const uint64_t ry = static_cast<uint64_t>((y >> rootShift_) - rootLo_[1]);

@@ -3,13 +3,11 @@
 
 #include "../failure.h"
 #include "../hash.h"
+#include "active_grid.h"
 #include "density_types.h"
 #include "sidecar_header.h"
 #include "sidecar_schema.h"
 #include "vdb_file.h"
-#include "vdb_tree.h"
-
-#include <tbb/spin_mutex.h>
 
 #include <algorithm>
 #include <array>
@@ -111,7 +109,7 @@ class SidecarReader {
     /// Reads a grid of one value per super-voxel; all of them cover one box.
     void readItems(const std::string& valueType, const std::string& suffix, Values values,
                    const Int3* anchor, Sidecar& sidecar) {
-        const ActiveGrid grid =
+        const PlacedGrid grid =
             readGrid(valueType, suffix, shift_, centreOffset(header_.superVoxelSize));
         if (tables_.empty()) {
             box_ = grid.support;
@@ -282,27 +280,13 @@ class SidecarReader {
                std::to_string(at[2]) + ")";
     }
 
-    static constexpr size_t kLeafVoxels = LeafBatch<float>::kLeafVoxels;
-    using Floats = std::array<float, 3>;
-
-    /// Active values of a leaf.
-    struct Leaf {
-        std::array<uint64_t, 8> mask;
-        std::vector<Floats> values;
-
-        bool isActive(size_t i) const { return (mask[i >> 6] >> (i & 63) & 1) != 0; }
-    };
-    /// A grid's active values, equal leaves once.
-    struct ActiveGrid {
+    struct PlacedGrid {
         std::string name;
-        size_t channels = 1;
         IntBox support;  // in the source's index space
-        std::vector<Leaf> leaves;
-        std::vector<std::pair<Int3, size_t>> places;  // origin of a leaf, and which one it is
-        std::vector<std::pair<IntBox, Floats>> tiles;
+        ActiveGrid grid;
     };
 
-    ActiveGrid readGrid(const std::string& valueType, const std::string& suffix, int shift,
+    PlacedGrid readGrid(const std::string& valueType, const std::string& suffix, int shift,
                         double offset) const {
         const std::string name = prefix_ + suffix;
         const VdbEntry& entry = findGrid(file_, name);
@@ -320,111 +304,13 @@ class SidecarReader {
         if (!sameMap(expected, affineMap(*header.transform, place))) {
             badSidecar(place, "does not lie over the file's control grid: its transform differs");
         }
-        ActiveGrid grid;
-        grid.name = name;
-        grid.channels = static_cast<size_t>(channelCount(valueType));
-        withValueType(valueType, [&](auto zero) {
-            VdbTree<decltype(zero)> tree(file_, entry, maxMemory_);
-            if (!(tree.background() == zero)) {
-                badSidecar(place, "background is not 0");
-            }
-            collect(tree, place, grid);
-        });
-        IntBox box;
-        std::vector<IntBox> leafBoxes(grid.leaves.size());
-        for (size_t l = 0; l < grid.leaves.size(); ++l) {
-            for (size_t i = 0; i < kLeafVoxels; ++i) {
-                if (grid.leaves[l].isActive(i)) {
-                    const Int3 at = SparseTable::childOrigin({{0, 0, 0}}, 0, i);
-                    leafBoxes[l].add(at, {{at[0] + 1, at[1] + 1, at[2] + 1}});
-                }
-            }
-        }
-        for (const auto& [origin, leaf] : grid.places) {
-            if (!leafBoxes[leaf].empty()) {
-                box.add(plus(origin, leafBoxes[leaf].lo), plus(origin, leafBoxes[leaf].hi));
-            }
-        }
-        for (const auto& [tileBox, value] : grid.tiles) {
-            box.add(tileBox.lo, tileBox.hi);
-        }
+        PlacedGrid placed{name, {}, readActiveGrid(file_, entry, maxMemory_)};
+        const IntBox box = placed.grid.box();
         for (size_t a = 0; a < 3 && !box.empty(); ++a) {
-            grid.support.lo[a] = (box.lo[a] << shift) + header_.origin[a];
-            grid.support.hi[a] = (box.hi[a] << shift) + header_.origin[a];
+            placed.support.lo[a] = (box.lo[a] << shift) + header_.origin[a];
+            placed.support.hi[a] = (box.hi[a] << shift) + header_.origin[a];
         }
-        return grid;
-    }
-
-    static Int3 plus(const Int3& a, const Int3& b) {
-        return {{a[0] + b[0], a[1] + b[1], a[2] + b[2]}};
-    }
-
-    template <class Value>
-    static Floats floatsOf(const Value& value) {
-        Floats result{};
-        const auto floats = toFloats(value);
-        std::copy(floats.begin(), floats.end(), result.begin());
-        return result;
-    }
-
-    /// Reads the active values of a grid.
-    template <class Value>
-    void collect(VdbTree<Value>& tree, const std::string& place, ActiveGrid& grid) const {
-        std::vector<size_t> which(tree.leafCount());
-        std::unordered_multimap<uint64_t, size_t> known;
-        tbb::spin_mutex lock;
-        tree.forEachBatch([&](const LeafBatch<Value>& batch) {
-            for (size_t i = 0; i < batch.count; ++i) {
-                Leaf leaf;
-                std::copy_n(batch.mask(i), leaf.mask.size(), leaf.mask.begin());
-                leaf.values.resize(kLeafVoxels);
-                for (size_t v = 0; v < kLeafVoxels; ++v) {
-                    if (leaf.isActive(v)) {
-                        leaf.values[v] = floatsOf(batch.leaf(i)[v]);
-                    }
-                }
-                const uint64_t hash =
-                    hashWords(leaf.values.data(), kLeafVoxels * sizeof(Floats) / 8,
-                              hashWords(leaf.mask.data(), 8, 0));
-                const tbb::spin_mutex::scoped_lock guard(lock);
-                which[batch.first + i] = addLeaf(std::move(leaf), hash, known, grid.leaves);
-                const uint64_t held = grid.leaves.size() * kLeafVoxels * sizeof(Floats);
-                if (maxMemory_ > 0 && held > maxMemory_) {
-                    throw Error(TRK_ERROR_OUT_OF_MEMORY,
-                                place + ": reading it takes more than maxMemory = " +
-                                    std::to_string(maxMemory_) + " bytes");
-                }
-            }
-        });
-        for (size_t i = 0; i < which.size(); ++i) {
-            const auto& o = tree.leafOrigins()[i];
-            grid.places.emplace_back(Int3{{o[0], o[1], o[2]}}, which[i]);
-        }
-        for (const Tile<Value>& tile : tree.tiles()) {
-            if (tile.active) {
-                const Int3 lo{{tile.origin[0], tile.origin[1], tile.origin[2]}};
-                const int64_t edge = int64_t{1} << tile.shift;
-                grid.tiles.emplace_back(IntBox{lo, plus(lo, {{edge, edge, edge}})},
-                                        floatsOf(tile.value));
-            }
-        }
-    }
-
-    /// Index of an equal leaf, or of a new one.
-    static size_t addLeaf(Leaf&& leaf, uint64_t hash,
-                          std::unordered_multimap<uint64_t, size_t>& known,
-                          std::vector<Leaf>& leaves) {
-        const auto [begin, end] = known.equal_range(hash);
-        for (auto it = begin; it != end; ++it) {
-            const Leaf& other = leaves[it->second];
-            if (other.mask == leaf.mask && std::memcmp(other.values.data(), leaf.values.data(),
-                                                       kLeafVoxels * sizeof(Floats)) == 0) {
-                return it->second;
-            }
-        }
-        known.emplace(hash, leaves.size());
-        leaves.push_back(std::move(leaf));
-        return leaves.size() - 1;
+        return placed;
     }
 
     /// Gives every value of a table an entry; equal ones have one.
@@ -433,7 +319,7 @@ class SidecarReader {
         ValueEntries(size_t channels, std::vector<float>& values)
             : channels_(channels), values_(values) {}
 
-        SparseTable::Entry of(const Floats& value) {
+        SparseTable::Entry of(const ActiveLeaf::Floats& value) {
             if (last_ == SparseTable::kEmpty || value != lastValue_) {
                 const auto [it, isNew] = known_.try_emplace(
                     value, static_cast<SparseTable::Entry>(values_.size() / channels_ + 1));
@@ -449,7 +335,7 @@ class SidecarReader {
 
       private:
         struct FloatsHash {
-            size_t operator()(const Floats& floats) const {
+            size_t operator()(const ActiveLeaf::Floats& floats) const {
                 uint64_t words[2] = {0, 0};
                 std::memcpy(words, floats.data(), sizeof(floats));
                 return hashWords(words, 2, 0);
@@ -457,23 +343,24 @@ class SidecarReader {
         };
         size_t channels_;
         std::vector<float>& values_;
-        std::unordered_map<Floats, SparseTable::Entry, FloatsHash> known_;
+        std::unordered_map<ActiveLeaf::Floats, SparseTable::Entry, FloatsHash> known_;
         SparseTable::Entry last_ = SparseTable::kEmpty;
-        Floats lastValue_{};
+        ActiveLeaf::Floats lastValue_{};
     };
 
     /// The active values of a grid, as a table over local space.
-    ValueTable makeTable(const ActiveGrid& grid, int shift, const Int3& anchor,
+    ValueTable makeTable(const PlacedGrid& placed, int shift, const Int3& anchor,
                          Values values) const {
-        checkAnchor(grid.support, anchor, grid.name);
+        checkAnchor(placed.support, anchor, placed.name);
+        const ActiveGrid& grid = placed.grid;
         ValueTable result;
         SparseTable& table = result.table;
-        table = SparseTable(shift, toLocal(grid.support, anchor));
+        table = SparseTable(shift, toLocal(placed.support, anchor));
         ValueEntries entries(grid.channels, result.values);
-        const auto entryOf = [&](const Floats& value, const Int3& at) {
+        const auto entryOf = [&](const ActiveLeaf::Floats& value, const Int3& at) {
             for (size_t c = 0; c < grid.channels; ++c) {
                 if (!std::isfinite(value[c]) || (values == Values::kNotNegative && value[c] < 0)) {
-                    badSidecar(file_.path(), "grid " + grid.name + ": " + where(at) +
+                    badSidecar(file_.path(), "grid " + placed.name + ": " + where(at) +
                                                  " is negative, NaN or infinite");
                 }
             }
@@ -495,10 +382,10 @@ class SidecarReader {
         std::vector<SparseTable::Place> places;
         std::vector<bool> made(grid.leaves.size());
         for (const auto& [origin, l] : grid.places) {
-            const Leaf& leaf = grid.leaves[l];
+            const ActiveLeaf& leaf = grid.leaves[l];
             SparseTable::Node& node = nodes[l];
             if (!made[l]) {
-                for (size_t i = 0; i < kLeafVoxels; ++i) {
+                for (size_t i = 0; i < ActiveLeaf::kVoxels; ++i) {
                     node[i] = leaf.isActive(i)
                                   ? entryOf(leaf.values[i], SparseTable::childOrigin(origin, 0, i))
                                   : SparseTable::kEmpty;
@@ -510,7 +397,7 @@ class SidecarReader {
                 places.push_back({local(origin), shift + 3, nodeEntries[l]});
                 continue;
             }
-            for (size_t i = 0; i < kLeafVoxels; ++i) {
+            for (size_t i = 0; i < ActiveLeaf::kVoxels; ++i) {
                 if (node[i] != SparseTable::kEmpty) {
                     places.push_back(
                         {local(SparseTable::childOrigin(origin, 0, i)), shift, node[i]});

@@ -2,10 +2,10 @@
 // vdbtrack bake: density in, sidecar out.
 #include "command_line.h"
 
-#include "bake.h"
+#include "bake/bake.h"
+#include "bake/levels.h"
 #include "io/density.h"
 #include "io/sidecar.h"
-#include "levels.h"
 
 #include <chrono>
 #include <cmath>
@@ -20,7 +20,7 @@ namespace po = boost::program_options;
 
 /// Says where a control that varies is worse than the constant one would be.
 void warnOfBadFit(const std::string& output, const trk::BakedVolume& baked) {
-    const vdbtools::ControlFit fit = vdbtools::measureFit(baked);
+    const trk::ControlFit fit = trk::measureFit(baked);
     char text[160] = "";
     if (std::fabs(fit.massRatio - 1) > 0.01) {
         std::snprintf(text, sizeof(text),
@@ -57,7 +57,7 @@ void run(const Command& command, const std::vector<std::string>& given) {
     if (size < 4 || size > 64 || (size & (size - 1)) != 0) {
         throw UsageError("--size " + std::to_string(size) + ": expected 4, 8, 16, 32 or 64");
     }
-    vdbtools::BakeOptions bakeOptions;
+    trk::BakeOptions bakeOptions;
     bakeOptions.superVoxelSize = size;
     bakeOptions.kind = static_cast<trk::ControlKind>(
         choiceIndex("control", arguments.text("control"), {"constant", "trilinear", "affine"}));
@@ -86,13 +86,13 @@ void run(const Command& command, const std::vector<std::string>& given) {
     trk::BakedVolume baked;
     trk::SidecarHeader header;
     // Controls that vary have more grids: no reason to have no picture.
-    const uint64_t limit = vdbtools::sidecarLimit(summary.fileBytes) +
+    const uint64_t limit = trk::sidecarLimit(summary.fileBytes) +
                            (bakeOptions.kind == trk::ControlKind::kConstant ? 0 : 40000);
     {
         const Progress progress(arguments, "baking " + input);
         bakeOptions.sidecarBytes = limit;
-        baked = vdbtools::bake(density.field, bakeOptions);
-        header = vdbtools::sidecarHeader(summary, density.field, baked);
+        baked = trk::bake(density.field, bakeOptions);
+        header = trk::sidecarHeader(summary, density.field, baked);
     }
     const double bakeTime = seconds() - readTime;
     {
@@ -100,7 +100,7 @@ void run(const Command& command, const std::vector<std::string>& given) {
         trk::writeSidecar(file, header, baked, summary.anchor);
         // How well values compress was an estimate.
         while (baked.previewSize > 0 && std::filesystem::file_size(file.path()) > limit) {
-            vdbtools::coarsenPreview(baked, density.field);
+            trk::coarsenPreview(baked, density.field);
             trk::writeSidecar(file, header, baked, summary.anchor);
         }
         file.commit();

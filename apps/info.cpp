@@ -2,7 +2,7 @@
 // vdbtrack info: what a .vdb file or a sidecar holds.
 #include "command_line.h"
 
-#include "bake.h"
+#include "bake/bake.h"
 #include "failure.h"
 #include "io/density.h"
 #include "io/density_types.h"
@@ -150,7 +150,7 @@ Json describeSidecar(const std::string& path, bool values) {
         json["clamped_negative"] = header.clamped;
     }
     if (values) {
-        const vdbtools::ControlFit fit = vdbtools::measureFit(sidecar.baked);
+        const trk::ControlFit fit = trk::measureFit(sidecar.baked);
         json["channels"] = sidecar.baked.channels;
         json["super_voxels"] = sidecar.baked.table.occupiedItems();
         json["residual_rms"] = fit.residualRms;

@@ -122,8 +122,8 @@ void write(const trk::OutputFile& file, const std::string& text) {
 /// The super-voxels to trace paths with: those of the residual way, `robust` at rate 1, that is
 /// cheapest for normal accuracy on secondary rays, in colour where that was measured, or else the
 /// default.
-vdbtools::BakeOptions bakeForScattering(const vdbtools::Sweep& sweep) {
-    vdbtools::BakeOptions options;
+trk::BakeOptions bakeForScattering(const vdbtools::Sweep& sweep) {
+    trk::BakeOptions options;
     options.levels = 0;
     const bool coloured = std::any_of(sweep.sets.begin(), sweep.sets.end(),
                                       [](const auto& set) { return set.coloured; });
@@ -170,11 +170,11 @@ void addScattering(const Arguments& arguments, const std::string& input, Scatter
                    Report& report) {
     const Progress progress(arguments, "tracing paths through " + input);
     const vdbtools::Source& source = report.source;
-    const vdbtools::BakeOptions bakeOptions = bakeForScattering(report.sweep);
+    const trk::BakeOptions bakeOptions = bakeForScattering(report.sweep);
     // Has no name: it goes when this ends.
     const trk::OutputFile sidecar(trk::temporaryFolder() + "/scattering.track.vdb", true);
-    const trk::BakedVolume baked = vdbtools::bake(*source.field, bakeOptions);
-    trk::writeSidecar(sidecar, vdbtools::sidecarHeader(source.summary, *source.field, baked), baked,
+    const trk::BakedVolume baked = trk::bake(*source.field, bakeOptions);
+    trk::writeSidecar(sidecar, trk::sidecarHeader(source.summary, *source.field, baked), baked,
                       source.summary.anchor);
     options.vdb = input;
     options.sidecar = sidecar.path();
@@ -279,9 +279,9 @@ void run(const Command& command, const std::vector<std::string>& given) {
         const double unscaledDepth = report.sweep.unscaledDepth;
         report.stripDepth = std::min(kMostDepth, static_cast<double>(first.scale) * unscaledDepth);
         report.stripScale = static_cast<float>(report.stripDepth / unscaledDepth);
-        vdbtools::BakeOptions bakeOptions;
+        trk::BakeOptions bakeOptions;
         bakeOptions.levels = 0;
-        const trk::BakedVolume baked = vdbtools::bake(*report.source.field, bakeOptions);
+        const trk::BakedVolume baked = trk::bake(*report.source.field, bakeOptions);
         for (const bool whole : {true, false}) {
             report.strips.push_back(
                 vdbtools::drawStrip(report.source, baked, whole, report.stripScale, 112, 16));

@@ -361,22 +361,22 @@ class SetRun {
 };
 
 SweepBake bakeInto(Volumes::Bakes& bakes, const Source& source, int size, ControlKind kind) {
-    BakeOptions options;
+    trk::BakeOptions options;
     options.superVoxelSize = size;
     options.kind = kind;
-    options.sidecarBytes = sidecarLimit(source.summary.fileBytes);
+    options.sidecarBytes = trk::sidecarLimit(source.summary.fileBytes);
     const auto start = std::chrono::steady_clock::now();
-    trk::BakedVolume& baked = bakes[{size, kind}] = bake(*source.field, options);
+    trk::BakedVolume& baked = bakes[{size, kind}] = trk::bake(*source.field, options);
     SweepBake result;
     result.seconds = secondsSince(start);
     result.size = size;
     result.kind = kind;
     result.superVoxels = static_cast<uint64_t>(baked.table.occupiedItems());
-    const ControlFit fit = measureFit(baked);
+    const trk::ControlFit fit = trk::measureFit(baked);
     result.residualShare = fit.fieldRms > 0 ? fit.residualRms / fit.fieldRms : 0;
     // Never committed: it leaves nothing behind.
     const trk::OutputFile file(trk::temporaryFolder() + "/measured.track.vdb", true);
-    trk::writeSidecar(file, sidecarHeader(source.summary, *source.field, baked), baked,
+    trk::writeSidecar(file, trk::sidecarHeader(source.summary, *source.field, baked), baked,
                       source.summary.anchor);
     result.sidecarBytes = std::filesystem::file_size(file.path());
     baked.levels.clear();  // no way looks at these

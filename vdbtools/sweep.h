@@ -2,7 +2,7 @@
 // What each way of estimating transmittance costs and buys on a volume: time, look-ups, variance.
 #pragma once
 
-#include "bake.h"
+#include "bake/bake.h"
 #include "io/density.h"
 #include "track/track.h"
 #include "volume.h"

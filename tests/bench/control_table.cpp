@@ -3,7 +3,7 @@
 // residual tracking (from their formulas), time, sidecar size. Volumes: the procedural cloud and
 // smoke of 256^3, or those named as arguments. Times are medians of interleaved rounds of one
 // thread; compare them within one table.
-#include "bake.h"
+#include "bake/bake.h"
 #include "io/sidecar.h"
 #include "stat/test_set.h"
 #include "support/fixtures.h"
@@ -69,7 +69,7 @@ void printVolume(const std::string& label, const std::string& vdb) {
              {ControlKind::kConstant, ControlKind::kTrilinear, ControlKind::kAffine}) {
             const std::string sidecar = fixtures::path("table.track.vdb");
             fixtures::bake(vdb, sidecar, size, 4, kind);
-            const vdbtools::ControlFit fit = vdbtools::measureFit(medium.bake(size, kind));
+            const trk::ControlFit fit = trk::measureFit(medium.bake(size, kind));
             char head[96];
             std::snprintf(head, sizeof(head), "| %d | %s | %.2f | %.0f kB |", size,
                           trk::controlName(kind), fit.residualRms / fit.constantRms,

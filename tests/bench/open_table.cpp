@@ -2,7 +2,7 @@
 // What opening and baking cost over OpenVDB's reading of the same file, as a Markdown table: of the
 // files named as arguments, or of procedural volumes of about 17, 7 and 0.2 million voxels. All in
 // one run, interleaved, medians of several rounds of wall time; files lie in the system's cache.
-#include "bake.h"
+#include "bake/bake.h"
 #include "support/fixtures.h"
 #include "track/track.hpp"
 

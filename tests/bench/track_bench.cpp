@@ -2,7 +2,7 @@
 // Time per ray of every method, on the procedural cloud or the density in TRACK_BENCH_VOLUME, for
 // camera rays (coherent) and rays from anywhere inside (incoherent), on one thread. Counters:
 // density look-ups a ray, variance of one estimate. Compare rows of one run, not of two.
-#include "bake.h"
+#include "bake/bake.h"
 #include "io/density.h"
 #include "support/fixtures.h"
 #include "support/rays.h"
@@ -165,8 +165,8 @@ void samplePaths(benchmark::State& state, TrkMethod method, const Case& measured
 void bakeStatistics(benchmark::State& state) {
     const trk::Density density = fixtures::load(volumeFile());
     for (auto ignored : state) {
-        benchmark::DoNotOptimize(vdbtools::bake(
-            density.field, fixtures::bakeOptions(static_cast<int>(state.range(0)), 4)));
+        benchmark::DoNotOptimize(
+            trk::bake(density.field, fixtures::bakeOptions(static_cast<int>(state.range(0)), 4)));
     }
 }
 

@@ -50,10 +50,10 @@ struct Scene {
         options.gridNamed = true;
         options.gridName = "density";
         const trk::Density density = fixtures::load(vdb, options.gridName);
-        const trk::BakedVolume baked = vdbtools::bake(density.field, fixtures::bakeOptions(16, 0));
+        const trk::BakedVolume baked = trk::bake(density.field, fixtures::bakeOptions(16, 0));
         {
             trk::OutputFile file(sidecar, true);
-            trk::writeSidecar(file, vdbtools::sidecarHeader(density.summary, density.field, baked),
+            trk::writeSidecar(file, trk::sidecarHeader(density.summary, density.field, baked),
                               baked, density.summary.anchor);
             file.commit();
         }

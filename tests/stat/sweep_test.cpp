@@ -189,10 +189,10 @@ TEST(Sweep, ThreeChannelsAndAnEmptyVolume) {
 
 TEST(Strips, RobustHasTheLeastNoiseAndAllMeanTheSame) {
     const vdbtools::Source source = fixtures::loadSource(fixtures::cloudFile(64));
-    vdbtools::BakeOptions bake;
+    trk::BakeOptions bake;
     bake.superVoxelSize = 8;
     const vdbtools::Strip strip =
-        vdbtools::drawStrip(source, vdbtools::bake(*source.field, bake), false, 0.5f, 40, 64);
+        vdbtools::drawStrip(source, trk::bake(*source.field, bake), false, 0.5f, 40, 64);
     ASSERT_EQ(strip.rows.size(), 4u);
     const auto meanOf = [](const std::vector<float>& values) {
         double sum = 0;
@@ -213,7 +213,7 @@ TEST(Strips, RobustHasTheLeastNoiseAndAllMeanTheSame) {
     // Nothing hides the noise of one control for everything, not even where it would be faster to
     // integrate exactly.
     const vdbtools::Strip whole =
-        vdbtools::drawStrip(source, vdbtools::bake(*source.field, bake), true, 20, 40, 16);
+        vdbtools::drawStrip(source, trk::bake(*source.field, bake), true, 20, 40, 16);
     double seen = 0;
     double noisy = 0;
     for (size_t i = 0; i < whole.rows[0].product.size(); ++i) {

@@ -134,7 +134,7 @@ const trk::BakedVolume& Medium::bake(int size, ControlKind kind) const {
                ? found->second
                : bakes_
                      .emplace(std::make_pair(size, kind),
-                              vdbtools::bake(*source.field, fixtures::bakeOptions(size, 0, kind)))
+                              trk::bake(*source.field, fixtures::bakeOptions(size, 0, kind)))
                      .first->second;
 }
 

@@ -1,7 +1,7 @@
 // SPDX-License-Identifier: Apache-2.0
 #include "fixtures.h"
 
-#include "bake.h"
+#include "bake/bake.h"
 #include "procedural.h"
 
 #include <unistd.h>
@@ -127,8 +127,8 @@ std::vector<NamedVolume> volumesOf(int argc, char** argv) {
     return volumes;
 }
 
-vdbtools::BakeOptions bakeOptions(int size, int levels, trk::ControlKind kind) {
-    vdbtools::BakeOptions options;
+trk::BakeOptions bakeOptions(int size, int levels, trk::ControlKind kind) {
+    trk::BakeOptions options;
     options.superVoxelSize = size;
     options.levels = levels;
     options.kind = kind;
@@ -138,10 +138,10 @@ vdbtools::BakeOptions bakeOptions(int size, int levels, trk::ControlKind kind) {
 void bake(const std::string& vdb, const std::string& sidecar, int size, int levels,
           trk::ControlKind kind) {
     const trk::Density density = load(vdb);
-    const vdbtools::BakeOptions options = bakeOptions(size, levels, kind);
+    const trk::BakeOptions options = bakeOptions(size, levels, kind);
     trk::OutputFile file(sidecar, true);
-    const trk::BakedVolume baked = vdbtools::bake(density.field, options);
-    trk::writeSidecar(file, vdbtools::sidecarHeader(density.summary, density.field, baked), baked,
+    const trk::BakedVolume baked = trk::bake(density.field, options);
+    trk::writeSidecar(file, trk::sidecarHeader(density.summary, density.field, baked), baked,
                       density.summary.anchor);
     file.commit();
 }

@@ -2,7 +2,7 @@
 // Volumes the tests make, and where they put them.
 #pragma once
 
-#include "bake.h"
+#include "bake/bake.h"
 #include "io/density.h"
 #include "io/openvdb_grids.h"
 #include "io/sidecar.h"
@@ -69,7 +69,7 @@ void bake(const std::string& vdb, const std::string& sidecar, int size, int leve
           trk::ControlKind kind = trk::ControlKind::kConstant);
 
 /// The options of such a bake.
-vdbtools::BakeOptions bakeOptions(int size, int levels,
-                                  trk::ControlKind kind = trk::ControlKind::kConstant);
+trk::BakeOptions bakeOptions(int size, int levels,
+                             trk::ControlKind kind = trk::ControlKind::kConstant);
 
 }  // namespace fixtures

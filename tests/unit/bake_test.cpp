@@ -1,6 +1,6 @@
 // SPDX-License-Identifier: Apache-2.0
 // Baked statistics against brute force; tiles, threads and sizes that must not matter.
-#include "bake.h"
+#include "bake/bake.h"
 
 #include "support/fixtures.h"
 
@@ -108,7 +108,7 @@ TEST_P(BakeSizes, StatisticsMatchTheirDefinition) {
     grid->tree().addTile(2, Coord(-256, 0, 0), 0.1f, true);
     const trk::Density d =
         fixtures::load(fixtures::write("stats" + std::to_string(size) + ".vdb", {grid}));
-    const BakedVolume baked = vdbtools::bake(d.field, fixtures::bakeOptions(size, 3));
+    const BakedVolume baked = trk::bake(d.field, fixtures::bakeOptions(size, 3));
     const auto items = byIndex(baked, d.summary.anchor);
     ASSERT_GT(items.size(), 8u);
     for (const auto& [index, item] : items) {
@@ -150,7 +150,7 @@ TEST_P(BakeSizes, StatisticsMatchTheirDefinition) {
 TEST_P(BakeSizes, LevelsKeepTheMass) {
     const int size = GetParam();
     const trk::Density d = fixtures::load(fixtures::cloudFile(64));
-    const BakedVolume baked = vdbtools::bake(d.field, fixtures::bakeOptions(size, 3));
+    const BakedVolume baked = trk::bake(d.field, fixtures::bakeOptions(size, 3));
     const auto mass = [](const trk::SparseTable& table, const auto& valueOf) {
         double sum = 0;
         table.forEach([&](const Int3&, int shift, trk::SparseTable::Entry entry) {
@@ -185,19 +185,19 @@ TEST(Bake, SameBitsWithAndWithoutTiles) {
     const trk::Density filled = fixtures::load(fixtures::write("filled.vdb", {grid}));
     EXPECT_NE(tiled.summary.digest, filled.summary.digest);
     for (const int size : {4, 8, 16, 32, 64}) {
-        expectSameBits(
-            vdbtools::bake(tiled.field, fixtures::bakeOptions(size, 2)), tiled.summary.anchor,
-            vdbtools::bake(filled.field, fixtures::bakeOptions(size, 2)), filled.summary.anchor);
+        expectSameBits(trk::bake(tiled.field, fixtures::bakeOptions(size, 2)), tiled.summary.anchor,
+                       trk::bake(filled.field, fixtures::bakeOptions(size, 2)),
+                       filled.summary.anchor);
     }
 }
 
 TEST(Bake, SameBitsForAnyNumberOfThreads) {
     const trk::Density d = fixtures::load(fixtures::cloudFile(96));
-    const BakedVolume all = vdbtools::bake(d.field, fixtures::bakeOptions(8, 3));
+    const BakedVolume all = trk::bake(d.field, fixtures::bakeOptions(8, 3));
     const tbb::global_control limit(tbb::global_control::max_allowed_parallelism, 1);
     const trk::Density again = fixtures::load(fixtures::cloudFile(96));
     EXPECT_EQ(again.summary.digest, d.summary.digest);
-    expectSameBits(all, d.summary.anchor, vdbtools::bake(again.field, fixtures::bakeOptions(8, 3)),
+    expectSameBits(all, d.summary.anchor, trk::bake(again.field, fixtures::bakeOptions(8, 3)),
                    d.summary.anchor);
 }
 
@@ -207,9 +207,9 @@ TEST(Bake, RealTiledAndFilledCloudsAgree) {
     const trk::Density tiled = fixtures::load(base + ".vdb");
     const trk::Density filled = fixtures::load(base + "_filled.vdb");
     for (const int size : {4, 8, 16, 32, 64}) {
-        expectSameBits(
-            vdbtools::bake(tiled.field, fixtures::bakeOptions(size, 4)), tiled.summary.anchor,
-            vdbtools::bake(filled.field, fixtures::bakeOptions(size, 4)), filled.summary.anchor);
+        expectSameBits(trk::bake(tiled.field, fixtures::bakeOptions(size, 4)), tiled.summary.anchor,
+                       trk::bake(filled.field, fixtures::bakeOptions(size, 4)),
+                       filled.summary.anchor);
     }
 }
 

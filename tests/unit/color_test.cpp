@@ -1,6 +1,6 @@
 // SPDX-License-Identifier: Apache-2.0
 // Densities of three channels: loading, baking, sidecars, proofs.
-#include "bake.h"
+#include "bake/bake.h"
 #include "failure.h"
 #include "io/sidecar.h"
 #include "support/fixtures.h"
@@ -116,14 +116,14 @@ TEST(Colour, EachChannelIsBakedAsIfItWereAlone) {
     const trk::Density d = fixtures::load(fixtures::write("color.vdb", {color}));
     for (const ControlKind kind : kKinds) {
         const auto options = fixtures::bakeOptions(8, 2, kind);
-        const trk::BakedVolume all = vdbtools::bake(d.field, options);
+        const trk::BakedVolume all = trk::bake(d.field, options);
         ASSERT_EQ(all.channels, 3u);
         for (size_t c = 0; c < 3; ++c) {
             const auto grey = fixtures::makeGrid(
                 CoordBBox(Coord(0), Coord(44)),
                 [&](const Coord& p) { return color->tree().getValue(p)[static_cast<int>(c)]; });
             const trk::Density one = fixtures::load(fixtures::write("one.vdb", {grey}));
-            const trk::BakedVolume alone = vdbtools::bake(one.field, options);
+            const trk::BakedVolume alone = trk::bake(one.field, options);
             size_t compared = 0;
             alone.table.forEach([&](const trk::Int3& lo, int, SparseTable::Entry entry) {
                 const auto found = all.table.find(lo[0], lo[1], lo[2]).entry;
@@ -169,7 +169,7 @@ TEST(Colour, EveryKindOfSidecarReadsBackAndIsProved) {
                 const std::string sidecar = fixtures::path("kinds.track.vdb");
                 fixtures::bake(vdb, sidecar, size, 2, kind);
                 const trk::BakedVolume expected =
-                    vdbtools::bake(d.field, fixtures::bakeOptions(size, 2, kind));
+                    trk::bake(d.field, fixtures::bakeOptions(size, 2, kind));
                 const trk::Sidecar read = trk::readSidecar(sidecar, &d.summary, TRK_CHECK_FULL);
                 EXPECT_EQ(read.baked.kind, kind);
                 EXPECT_EQ(read.header.valueType, d.summary.valueType);

@@ -1,7 +1,7 @@
 // SPDX-License-Identifier: Apache-2.0
 // Controls that vary within a super-voxel: their fits, their closed forms, their bounds.
-#include "bake.h"
-#include "control_fit.h"
+#include "bake/bake.h"
+#include "bake/control_fit.h"
 #include "support/fixtures.h"
 #include "support/rays.h"
 #include "variant.h"
@@ -28,8 +28,8 @@ const std::vector<ControlKind> kVarying{ControlKind::kTrilinear, ControlKind::kA
 
 /// The definition of corner moments: sums over vertices, weighed by the part inside.
 template <class F>
-vdbtools::CornerMoments momentsOf(const Int3& cell, int size, const F& f) {
-    vdbtools::CornerMoments moments{};
+trk::CornerMoments momentsOf(const Int3& cell, int size, const F& f) {
+    trk::CornerMoments moments{};
     for (int i = 0; i < (size + 1) * (size + 1) * (size + 1); ++i) {
         const int at[3] = {i / ((size + 1) * (size + 1)), i / (size + 1) % (size + 1),
                            i % (size + 1)};
@@ -69,15 +69,15 @@ TEST(ControlFit, AnUnboundedRampLeavesAtMostEightUlp) {
         for (int64_t i = 0; i < 125; ++i) {
             places.push_back({{i / 25, i / 5 % 5, i % 5}});
         }
-        std::vector<vdbtools::CornerMoments> moments;
+        std::vector<trk::CornerMoments> moments;
         for (const Int3& place : places) {
             moments.push_back(momentsOf(place, size, ramp));
         }
-        std::vector<vdbtools::CornerFit::Cell> cells;
+        std::vector<trk::CornerFit::Cell> cells;
         for (size_t i = 0; i < places.size(); ++i) {
             cells.push_back({places[i], &moments[i], 1e30});
         }
-        const vdbtools::CornerFit fit(
+        const trk::CornerFit fit(
             cells, [](const Int3&) { return std::nullopt; }, size);
         for (size_t i = 0; i < places.size(); ++i) {
             std::array<float, 8> corners{};
@@ -93,7 +93,7 @@ TEST(ControlFit, AnUnboundedRampLeavesAtMostEightUlp) {
                 mean += m;
             }
             const auto gradient =
-                trk::constrainGradient(vdbtools::fitGradient(moments[i], size).data(), mean, size);
+                trk::constrainGradient(trk::fitGradient(moments[i], size).data(), mean, size);
             const auto affine = trk::controlPolynomial(
                 ControlKind::kAffine, static_cast<float>(mean), gradient.data(), size);
             for (int v = 0; v < 27; ++v) {
@@ -145,7 +145,7 @@ TEST(ControlFit, TheInteriorOfABoundedRampFitsTenTimesBetter) {
                            [](int64_t i) { return i >= 6 && i < kEdge - 6; });
     };
     const auto rmsOf = [&](ControlKind kind) {
-        return residualRms(vdbtools::bake(d.field, fixtures::bakeOptions(kSize, 0, kind)),
+        return residualRms(trk::bake(d.field, fixtures::bakeOptions(kSize, 0, kind)),
                            d.summary.anchor, interior);
     };
     const double constant = rmsOf(ControlKind::kConstant);
@@ -166,8 +166,8 @@ TEST(ControlFit, AGaussianIsNeverFittedWorseThanByConstants) {
             });
         const trk::Density d = fixtures::load(fixtures::write("gaussian.vdb", {grid}));
         for (const ControlKind kind : kVarying) {
-            const vdbtools::ControlFit fit =
-                vdbtools::measureFit(vdbtools::bake(d.field, fixtures::bakeOptions(size, 0, kind)));
+            const trk::ControlFit fit =
+                trk::measureFit(trk::bake(d.field, fixtures::bakeOptions(size, 0, kind)));
             EXPECT_LE(fit.residualRms, fit.constantRms) << size << trk::controlName(kind);
             EXPECT_NEAR(fit.massRatio, 1, 0.01);
         }
@@ -179,7 +179,7 @@ TEST(ControlFit, TrilinearCornersAreContinuousNotNegativeAndZeroBesideNothing) {
     const trk::Density d = fixtures::load(fixtures::cloudFile(96));
     for (const int size : {4, 8, 16}) {
         const BakedVolume baked =
-            vdbtools::bake(d.field, fixtures::bakeOptions(size, 0, ControlKind::kTrilinear));
+            trk::bake(d.field, fixtures::bakeOptions(size, 0, ControlKind::kTrilinear));
         std::map<Int3, float> values;
         baked.table.forEach([&](const Int3& lo, int shift, SparseTable::Entry entry) {
             for (int64_t corner = 0; corner < 8 && shift == baked.superVoxelShift; ++corner) {
@@ -205,7 +205,7 @@ TEST(ControlFit, TrilinearCornersAreContinuousNotNegativeAndZeroBesideNothing) {
             }
         }
         EXPECT_GT(besideNothing, 100u);
-        EXPECT_NEAR(vdbtools::measureFit(baked).massRatio, 1, 0.01);
+        EXPECT_NEAR(trk::measureFit(baked).massRatio, 1, 0.01);
     }
 }
 
@@ -219,8 +219,8 @@ TEST(ControlFit, MassStaysWhereItWas) {
     grid->tree().voxelizeActiveTiles();
     const trk::Density d = fixtures::load(fixtures::write("sheets.vdb", {grid}));
     const BakedVolume baked =
-        vdbtools::bake(d.field, fixtures::bakeOptions(8, 0, ControlKind::kTrilinear));
-    EXPECT_LT(vdbtools::measureFit(baked).massRatio, 0.5);
+        trk::bake(d.field, fixtures::bakeOptions(8, 0, ControlKind::kTrilinear));
+    EXPECT_LT(trk::measureFit(baked).massRatio, 0.5);
     double mass[2] = {0, 0};
     baked.table.forEach([&](const Int3& lo, int, SparseTable::Entry entry) {
         const size_t item = SparseTable::index(entry);
@@ -250,7 +250,7 @@ TEST(ControlFit, AffineControlsAreNotNegative) {
     const trk::Density d = fixtures::load(fixtures::cloudFile(96));
     for (const int size : {4, 16}) {
         const BakedVolume baked =
-            vdbtools::bake(d.field, fixtures::bakeOptions(size, 0, ControlKind::kAffine));
+            trk::bake(d.field, fixtures::bakeOptions(size, 0, ControlKind::kAffine));
         size_t sloped = 0;
         size_t touching = 0;
         for (size_t i = 0; i < baked.items.size(); ++i) {
@@ -373,7 +373,7 @@ TEST(Control, BoundsOfConstantControlsCoverWhatLookUpsReturn) {
     });
     const std::string vdb = fixtures::write("adversarial.vdb", {grid});
     const trk::Density density = fixtures::load(vdb);
-    const trk::BakedVolume baked = vdbtools::bake(density.field, fixtures::bakeOptions(4, 0));
+    const trk::BakedVolume baked = trk::bake(density.field, fixtures::bakeOptions(4, 0));
     size_t outside = 0;  // of what was baked, which is of the corners
     for (const TrkChoice choice :
          {TRK_CHOICE_ROBUST, TRK_CHOICE_MEAN, TRK_CHOICE_MIN, TRK_CHOICE_MAX}) {
@@ -439,8 +439,8 @@ TEST(Bake, VaryingControlsHaveTheSameBitsForTilesAndThreads) {
     for (const ControlKind kind : kVarying) {
         for (const int size : {4, 8, 32}) {
             const auto options = fixtures::bakeOptions(size, 1, kind);
-            const BakedVolume a = vdbtools::bake(tiled.field, options);
-            const BakedVolume b = vdbtools::bake(filled.field, options);
+            const BakedVolume a = trk::bake(tiled.field, options);
+            const BakedVolume b = trk::bake(filled.field, options);
             const Int3 shift{{tiled.summary.anchor[0] - filled.summary.anchor[0],
                               tiled.summary.anchor[1] - filled.summary.anchor[1],
                               tiled.summary.anchor[2] - filled.summary.anchor[2]}};

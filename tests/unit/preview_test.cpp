@@ -1,9 +1,9 @@
 // SPDX-License-Identifier: Apache-2.0
 // Lit previews: what their layers mean, and that they come nearer as super-voxels shrink.
+#include "bake/preview_scale.h"
 #include "failure.h"
 #include "io/sidecar.h"
 #include "lit_preview.h"
-#include "preview_scale.h"
 #include "support/fixtures.h"
 #include "track/track.h"
 #include "transmittance.h"
@@ -220,13 +220,13 @@ TEST(Preview, DrawsNoEdgesOfSuperVoxels) {
 
 TEST(Preview, TheFinestMeansAreDrawnUnlessALevelIsAskedFor) {
     const trk::Density density = fixtures::load(fixtures::cloudFile(96));
-    vdbtools::BakeOptions options = fixtures::bakeOptions(32, 1);
+    trk::BakeOptions options = fixtures::bakeOptions(32, 1);
     options.sidecarBytes = 1000000;
-    const trk::BakedVolume baked = vdbtools::bake(density.field, options);
+    const trk::BakedVolume baked = trk::bake(density.field, options);
     ASSERT_EQ(baked.previewSize, 1);
     const std::string sidecar = fixtures::path("finest.track.vdb");
     trk::OutputFile file(sidecar, true);
-    trk::writeSidecar(file, vdbtools::sidecarHeader(density.summary, density.field, baked), baked,
+    trk::writeSidecar(file, trk::sidecarHeader(density.summary, density.field, baked), baked,
                       density.summary.anchor);
     file.commit();
     trk::VolumeOptions volumeOptions;
@@ -265,7 +265,7 @@ TEST(Preview, TheScaleIsThatOfTheVolumeAlone) {
             it.setValue(factor * *it);
         }
         const trk::Density d = fixtures::load(fixtures::write("scaled.vdb", {grid}));
-        return vdbtools::previewScale(d.field, d.summary.indexToWorld);
+        return trk::previewScale(d.field, d.summary.indexToWorld);
     };
     const double thin = scaleOf(1e-6f);
     EXPECT_NEAR(scaleOf(1e-3f) * 1000, thin, 0.06 * thin);

@@ -2,7 +2,7 @@
 // The sidecar: what is written is read, and nothing that does not fit is accepted.
 #include "io/sidecar.h"
 
-#include "bake.h"
+#include "bake/bake.h"
 #include "failure.h"
 #include "io/vdb_file.h"
 #include "support/fixtures.h"
@@ -79,7 +79,7 @@ TEST(Sidecar, ReadsBackWhatWasWritten) {
     for (const int size : {4, 16, 64}) {
         const Baked baked = makeBaked("roundtrip" + std::to_string(size), size);
         const trk::BakedVolume expected =
-            vdbtools::bake(baked.density.field, fixtures::bakeOptions(size, 2));
+            trk::bake(baked.density.field, fixtures::bakeOptions(size, 2));
         const trk::Sidecar read =
             trk::readSidecar(baked.sidecar, &baked.density.summary, TRK_CHECK_FULL);
         EXPECT_EQ(read.header.superVoxelSize, size);
@@ -257,8 +257,7 @@ TEST(Sidecar, LevelsOfFarPartsAreReadWhole) {
     for (const int size : {4, 16, 64}) {
         const std::string sidecar = fixtures::path("far-levels.track.vdb");
         fixtures::bake(vdb, sidecar, size, 8);
-        const trk::BakedVolume baked =
-            vdbtools::bake(density.field, fixtures::bakeOptions(size, 8));
+        const trk::BakedVolume baked = trk::bake(density.field, fixtures::bakeOptions(size, 8));
         const trk::Sidecar read = trk::readSidecar(sidecar, &density.summary, TRK_CHECK_FULL);
         EXPECT_EQ(read.baked.table.occupiedItems(), baked.table.occupiedItems());
         ASSERT_EQ(read.baked.levels.size(), 8u);
@@ -289,13 +288,13 @@ TEST(Sidecar, OfASmallVolumeIsSmallWhereverThatLies) {
                                 Coord(-7, 100, 8185), Coord(2000000000, -2000000000, 5)}) {
         const std::string vdb = fixtures::write("ball.vdb", {ballAt(20, offset)});
         const trk::Density density = fixtures::load(vdb);
-        vdbtools::BakeOptions options = fixtures::bakeOptions(16, 4);
-        options.sidecarBytes = vdbtools::sidecarLimit(density.summary.fileBytes);
-        const trk::BakedVolume baked = vdbtools::bake(density.field, options);
+        trk::BakeOptions options = fixtures::bakeOptions(16, 4);
+        options.sidecarBytes = trk::sidecarLimit(density.summary.fileBytes);
+        const trk::BakedVolume baked = trk::bake(density.field, options);
         const std::string sidecar = fixtures::path("ball.track.vdb");
         trk::OutputFile file(sidecar, true);
-        trk::writeSidecar(file, vdbtools::sidecarHeader(density.summary, density.field, baked),
-                          baked, density.summary.anchor);
+        trk::writeSidecar(file, trk::sidecarHeader(density.summary, density.field, baked), baked,
+                          density.summary.anchor);
         file.commit();
         EXPECT_LE(std::filesystem::file_size(sidecar), 100000u) << offset;
         EXPECT_GT(baked.previewSize, 0) << offset;
@@ -350,7 +349,7 @@ TEST(Sidecar, OfVoxelsAtTheEndsOfTheWorldOpensInNoTime) {
     const trk::Sidecar read = trk::readSidecar(sidecar, &density.summary, TRK_CHECK_FULL);
     std::printf("%.3f s\n", static_cast<double>(std::clock() - start) / CLOCKS_PER_SEC);
     EXPECT_EQ(read.baked.table.occupiedItems(),
-              vdbtools::bake(density.field, fixtures::bakeOptions(16, 4)).table.occupiedItems());
+              trk::bake(density.field, fixtures::bakeOptions(16, 4)).table.occupiedItems());
 }
 
 TEST(Sidecar, GradientsAreOfEveryKindAndReadBack) {
@@ -359,7 +358,7 @@ TEST(Sidecar, GradientsAreOfEveryKindAndReadBack) {
          {trk::ControlKind::kConstant, trk::ControlKind::kAffine, trk::ControlKind::kTrilinear}) {
         fixtures::bake(baked.vdb, baked.sidecar, 8, 2, kind);
         const trk::BakedVolume expected =
-            vdbtools::bake(baked.density.field, fixtures::bakeOptions(8, 2, kind));
+            trk::bake(baked.density.field, fixtures::bakeOptions(8, 2, kind));
         const trk::Sidecar read = trk::readSidecar(baked.sidecar, &baked.density.summary,
                                                    TRK_CHECK_FULL, trk::SidecarParts::kAll);
         size_t sloped = 0;
@@ -394,10 +393,10 @@ TEST(Sidecar, OfOneOfSeveralGridsOfANameBearsItsIndex) {
     const std::string vdb =
         fixtures::write("twins.vdb", {fixtures::makeBlob(20), fixtures::makeBlob(30)});
     const trk::Density density = fixtures::load(vdb, "density[1]");
-    const trk::BakedVolume baked = vdbtools::bake(density.field, fixtures::bakeOptions(8, 1));
+    const trk::BakedVolume baked = trk::bake(density.field, fixtures::bakeOptions(8, 1));
     const std::string sidecar = fixtures::path("twins.track.vdb");
     trk::OutputFile file(sidecar, true);
-    trk::writeSidecar(file, vdbtools::sidecarHeader(density.summary, density.field, baked), baked,
+    trk::writeSidecar(file, trk::sidecarHeader(density.summary, density.field, baked), baked,
                       density.summary.anchor);
     file.commit();
     openvdb::io::File grids(sidecar);

@@ -2,18 +2,18 @@
 // Statistics, control and preview levels of a density: what a sidecar stores.
 #pragma once
 
-#include "extinction_field.h"
-#include "io/sidecar.h"
-#include "super_voxels.h"
+#include "../extinction_field.h"
+#include "../io/sidecar.h"
+#include "../super_voxels.h"
 
 #include <cstdint>
 
-namespace vdbtools {
+namespace trk {
 
 struct BakeOptions {
     int superVoxelSize = 16;  ///< a power of two from 4 to 64, in voxels
     int levels = 4;           ///< preview levels at most, each of super-voxels twice as large
-    trk::ControlKind kind = trk::ControlKind::kConstant;
+    ControlKind kind = ControlKind::kConstant;
     /// What the sidecar may take as a file, which decides how fine the means for pictures are; 0:
     /// none are made.
     uint64_t sidecarBytes = 0;
@@ -21,14 +21,14 @@ struct BakeOptions {
 
 /// Bakes a field, in parallel. The result has the same bits for any number of threads, and with or
 /// without tiles in the source.
-trk::BakedVolume bake(const trk::ExtinctionField& field, const BakeOptions& options);
+BakedVolume bake(const ExtinctionField& field, const BakeOptions& options);
 
 /// How large a sidecar of a density of `sourceBytes` as a file may be, pictures included.
 uint64_t sidecarLimit(uint64_t sourceBytes);
 
 /// What a sidecar of such a bake says of itself.
-trk::SidecarHeader sidecarHeader(const trk::DensitySummary& source,
-                                 const trk::ExtinctionField& field, const trk::BakedVolume& baked);
+SidecarHeader sidecarHeader(const DensitySummary& source, const ExtinctionField& field,
+                            const BakedVolume& baked);
 
 /// How well a bake's control fits, over all occupied super-voxels and channels.
 struct ControlFit {
@@ -37,6 +37,6 @@ struct ControlFit {
     double fieldRms = 0;     ///< of the density itself
     double massRatio = 1;    ///< the control's mass over the density's
 };
-ControlFit measureFit(const trk::BakedVolume& baked);
+ControlFit measureFit(const BakedVolume& baked);
 
-}  // namespace vdbtools
+}  // namespace trk

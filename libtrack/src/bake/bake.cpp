@@ -1,10 +1,10 @@
 // SPDX-License-Identifier: Apache-2.0
 #include "bake.h"
 
+#include "../parallel.h"
 #include "control_fit.h"
 #include "levels.h"
 #include "moments.h"
-#include "parallel.h"
 #include "preview_scale.h"
 
 #include <algorithm>
@@ -16,19 +16,8 @@
 #include <unordered_map>
 #include <vector>
 
-namespace vdbtools {
+namespace trk {
 namespace {
-
-using trk::BakedSuperVoxel;
-using trk::BakedVolume;
-using trk::ControlKind;
-using trk::ControlPolynomial;
-using trk::ExtinctionField;
-using trk::Int3;
-using trk::roundUp;
-using trk::SparseTable;
-using trk::ValueTable;
-using trk::Vec3d;
 
 constexpr float kInfinity = std::numeric_limits<float>::infinity();
 
@@ -78,7 +67,7 @@ class Baker {
 
     template <class Body>
     static void forEach(size_t count, const Body& body) {
-        trk::parallelFor(count, 32, body);
+        parallelFor(count, 32, body);
     }
 
     /// Moments of every cube of every brick: each vertex is read once, whatever shares its brick.
@@ -250,7 +239,7 @@ class Baker {
             addGradients(i);
             if (kind_ == ControlKind::kAffine) {
                 for (size_t c = 0; c < channels_; ++c) {
-                    const auto gradient = trk::constrainGradient(
+                    const auto gradient = constrainGradient(
                         &baked_.gradients[baked_.gradients.size() - 3 * (channels_ - c)],
                         static_cast<double>(meanOf(moments(i, c))), size_);
                     baked_.shapes.insert(baked_.shapes.end(), gradient.begin(), gradient.end());
@@ -472,9 +461,9 @@ uint64_t sidecarLimit(uint64_t sourceBytes) {
     return std::max(kLeast, sourceBytes / (sourceBytes < kSmall ? 5 : 10));
 }
 
-trk::SidecarHeader sidecarHeader(const trk::DensitySummary& source, const ExtinctionField& field,
-                                 const BakedVolume& baked) {
-    trk::SidecarHeader header;
+SidecarHeader sidecarHeader(const DensitySummary& source, const ExtinctionField& field,
+                            const BakedVolume& baked) {
+    SidecarHeader header;
     header.toolVersion = TRACK_VERSION;
     header.sourceFile = std::filesystem::path(source.path).filename().string();
     header.source = source.grid;
@@ -525,4 +514,4 @@ ControlFit measureFit(const BakedVolume& baked) {
     return fit;
 }
 
-}  // namespace vdbtools
+}  // namespace trk

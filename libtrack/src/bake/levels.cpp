@@ -1,9 +1,9 @@
 // SPDX-License-Identifier: Apache-2.0
 #include "levels.h"
 
-#include "hash.h"
+#include "../hash.h"
+#include "../parallel.h"
 #include "moments.h"
-#include "parallel.h"
 
 #include <algorithm>
 #include <array>
@@ -15,17 +15,12 @@
 #include <unordered_map>
 #include <utility>
 
-namespace vdbtools {
+namespace trk {
 namespace {
-
-using trk::ExtinctionField;
-using trk::Int3;
-using trk::SparseTable;
-using trk::ValueTable;
 
 /// Means of the super-voxels twice as large as those of `finer`. `meanOf(index, channel)`.
 template <class MeanOf>
-ValueTable nextLevel(const SparseTable& finer, const trk::IntBox& box, size_t channels,
+ValueTable nextLevel(const SparseTable& finer, const IntBox& box, size_t channels,
                      const MeanOf& meanOf) {
     ValueTable level;
     const int shift = finer.itemShift() + 1;
@@ -35,7 +30,7 @@ ValueTable nextLevel(const SparseTable& finer, const trk::IntBox& box, size_t ch
     const auto hash = [](const Mean& mean) {
         uint64_t words[2] = {0, 0};
         std::memcpy(words, mean.data(), sizeof(mean));
-        return trk::hashWords(words, 2, 0);
+        return hashWords(words, 2, 0);
     };
     std::unordered_map<Mean, SparseTable::Entry, decltype(hash)> known(64, hash);
     const auto add = [&](const Mean& mean) {
@@ -100,7 +95,7 @@ ValueTable meansOf(const ExtinctionField& field, int shift) {
     const size_t perAxis = 8 / edge;
     const size_t cubes = perAxis * perAxis * perAxis;
     std::vector<float> brickMeans(field.brickCount() * cubes * channels);
-    trk::parallelFor(field.brickCount(), 32, [&](size_t b) {
+    parallelFor(field.brickCount(), 32, [&](size_t b) {
         float vertices[ExtinctionField::kBrickVertices];
         for (size_t c = 0; c < channels; ++c) {
             for (size_t i = 0; i < ExtinctionField::kBrickVertices; ++i) {
@@ -149,7 +144,7 @@ ValueTable meansOf(const ExtinctionField& field, int shift) {
     return means;
 }
 
-int64_t largestExtent(const trk::IntBox& box) {
+int64_t largestExtent(const IntBox& box) {
     int64_t extent = 0;
     for (size_t a = 0; a < 3; ++a) {
         extent = std::max(extent, box.hi[a] - box.lo[a]);
@@ -160,9 +155,9 @@ int64_t largestExtent(const trk::IntBox& box) {
 /// Bytes of a sidecar without means for pictures: a grid's nodes, which VDB does not compress, and
 /// its values, which compress little.
 constexpr double kGridBytes = 10500;
-double estimatedBytes(const trk::BakedVolume& baked) {
+double estimatedBytes(const BakedVolume& baked) {
     constexpr double kValue = 4.2;
-    const double statistics = baked.kind == trk::ControlKind::kConstant ? 5 : 7;
+    const double statistics = baked.kind == ControlKind::kConstant ? 5 : 7;
     const auto channels = static_cast<double>(baked.channels);
     const double grids = statistics + channels + static_cast<double>(baked.levels.size());
     return kGridBytes * grids + kValue * channels * (statistics + 3 + 0.15) *
@@ -171,7 +166,7 @@ double estimatedBytes(const trk::BakedVolume& baked) {
 
 }  // namespace
 
-void addLevels(trk::BakedVolume& baked, const trk::IntBox& box, int count) {
+void addLevels(BakedVolume& baked, const IntBox& box, int count) {
     const size_t channels = baked.channels;
     for (int i = 0; i < count; ++i) {
         const SparseTable& finer = i == 0 ? baked.table : baked.levels.back().table;
@@ -186,7 +181,7 @@ void addLevels(trk::BakedVolume& baked, const trk::IntBox& box, int count) {
     }
 }
 
-void addPreview(trk::BakedVolume& baked, const ExtinctionField& field, uint64_t sidecarBytes) {
+void addPreview(BakedVolume& baked, const ExtinctionField& field, uint64_t sidecarBytes) {
     constexpr int64_t kFinest =
         160;                       // cubes along the longest edge: about three pixels of 512 each
     constexpr double kCube = 3.9;  // bytes a channel, of values and their nodes
@@ -211,7 +206,7 @@ void addPreview(trk::BakedVolume& baked, const ExtinctionField& field, uint64_t 
     }
 }
 
-void coarsenPreview(trk::BakedVolume& baked, const ExtinctionField& field) {
+void coarsenPreview(BakedVolume& baked, const ExtinctionField& field) {
     baked.previewSize *= 2;
     if (baked.previewSize >= baked.superVoxelSize()) {
         baked.previewSize = 0;
@@ -224,4 +219,4 @@ void coarsenPreview(trk::BakedVolume& baked, const ExtinctionField& field) {
                   [&](size_t item, size_t c) { return finer.values[item * field.channels() + c]; });
 }
 
-}  // namespace vdbtools
+}  // namespace trk

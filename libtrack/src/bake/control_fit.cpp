@@ -1,8 +1,8 @@
 // SPDX-License-Identifier: Apache-2.0
 #include "control_fit.h"
 
-#include "hash.h"
-#include "parallel.h"
+#include "../hash.h"
+#include "../parallel.h"
 
 #include <algorithm>
 #include <cmath>
@@ -10,9 +10,7 @@
 #include <limits>
 #include <numeric>
 
-namespace vdbtools {
-
-using trk::Int3;
+namespace trk {
 
 namespace {
 
@@ -42,7 +40,7 @@ std::array<float, 3> fitGradient(const CornerMoments& moments, int size) {
 }
 
 size_t CornerFit::Hash::operator()(const Int3& p) const {
-    return trk::hashWords(p.data(), p.size(), 0);
+    return hashWords(p.data(), p.size(), 0);
 }
 
 CornerFit::CornerFit(const std::vector<Cell>& cells, const Given& given, int size) {
@@ -119,7 +117,7 @@ void CornerFit::findParts() {
 void CornerFit::multiply(const std::vector<double>& x, std::vector<double>& result) const {
     std::fill(result.begin(), result.end(), 0.0);
     for (const std::vector<uint32_t>& cells : independent_) {
-        trk::parallelFor(cells.size(), 1024, [&](size_t i) {
+        parallelFor(cells.size(), 1024, [&](size_t i) {
             const std::array<uint32_t, 8>& corners = cornersOf_[cells[i]];
             double v[8];
             for (size_t k = 0; k < 8; ++k) {
@@ -252,4 +250,4 @@ void CornerFit::keepMass(const std::vector<double>& mass) {
     }
 }
 
-}  // namespace vdbtools
+}  // namespace trk

@@ -3,24 +3,24 @@
 // super-voxels.
 #pragma once
 
-#include "extinction_field.h"
-#include "super_voxels.h"
+#include "../extinction_field.h"
+#include "../super_voxels.h"
 
 #include <cstdint>
 
-namespace vdbtools {
+namespace trk {
 
 /// Adds levels to a bake of a field that lies in `box` (cells): `count`, or fewer where four
 /// super-voxels an axis hold everything: coarser ones save a ray nothing.
-void addLevels(trk::BakedVolume& baked, const trk::IntBox& box, int count);
+void addLevels(BakedVolume& baked, const IntBox& box, int count);
 
 /// Adds means of cubes smaller than super-voxels, where the latter are too large for a picture: as
 /// fine as shows in one of 512 pixels, and as keeps the whole bake as a file within `sidecarBytes`,
 /// by estimate.
-void addPreview(trk::BakedVolume& baked, const trk::ExtinctionField& field, uint64_t sidecarBytes);
+void addPreview(BakedVolume& baked, const ExtinctionField& field, uint64_t sidecarBytes);
 
 /// Makes the cubes for pictures twice as large, or where they would be as large as super-voxels
 /// drops them.
-void coarsenPreview(trk::BakedVolume& baked, const trk::ExtinctionField& field);
+void coarsenPreview(BakedVolume& baked, const ExtinctionField& field);
 
-}  // namespace vdbtools
+}  // namespace trk

@@ -1,7 +1,7 @@
 // SPDX-License-Identifier: Apache-2.0
 #include "preview_scale.h"
 
-#include "parallel.h"
+#include "../parallel.h"
 
 #include <algorithm>
 #include <array>
@@ -11,19 +11,15 @@
 #include <cstring>
 #include <vector>
 
-namespace vdbtools {
+namespace trk {
 namespace {
-
-using trk::ExtinctionField;
-using trk::LocalRay;
-using trk::Vec3d;
 
 /// Integral of the density (the mean over channels) along the line of an axis through a place,
 /// times the length of a voxel along it.
 double depthThrough(const ExtinctionField& field, const Vec3d& place, int axis, double voxel) {
     LocalRay ray;
     ray.origin = place;
-    const trk::IntBox& box = field.box();
+    const IntBox& box = field.box();
     for (int a = 0; a < 3; ++a) {
         ray.direction[a] = a == axis ? 1 : 0;
         ray.inverse[a] = a == axis ? 1 : 1e300;
@@ -53,14 +49,14 @@ double twoDigits(double value) {
 
 }  // namespace
 
-double previewScale(const ExtinctionField& field, const trk::AffineMap& indexToWorld) {
+double previewScale(const ExtinctionField& field, const AffineMap& indexToWorld) {
     constexpr size_t kPlaces = 1024;
     size_t count = 0;
-    field.table().forEach([&](const trk::Int3&, int, trk::SparseTable::Entry) { ++count; });
+    field.table().forEach([&](const Int3&, int, SparseTable::Entry) { ++count; });
     const size_t step = std::max<size_t>(1, count / kPlaces);
     std::vector<Vec3d> centres;
     size_t i = 0;
-    field.table().forEach([&](const trk::Int3& lo, int shift, trk::SparseTable::Entry) {
+    field.table().forEach([&](const Int3& lo, int shift, SparseTable::Entry) {
         if (i++ % step != step / 2) {
             return;
         }
@@ -71,7 +67,7 @@ double previewScale(const ExtinctionField& field, const trk::AffineMap& indexToW
         centres.push_back(centre);
     });
     std::vector<double> depths(3 * centres.size());
-    trk::parallelFor(depths.size(), 16, [&](size_t k) {
+    parallelFor(depths.size(), 16, [&](size_t k) {
         const int axis = static_cast<int>(k % 3);
         depths[k] = depthThrough(field, centres[k / 3], axis, length(indexToWorld.column(axis)));
     });
@@ -92,4 +88,4 @@ double previewScale(const ExtinctionField& field, const trk::AffineMap& indexToW
     return std::min(twoDigits(kShown / *middle), 1e37);  // it becomes a float
 }
 
-}  // namespace vdbtools
+}  // namespace trk

@@ -2,13 +2,13 @@
 // Statistics of cubes of cells of one brick, in one channel.
 #pragma once
 
+#include "../extinction_field.h"
 #include "control_fit.h"
-#include "extinction_field.h"
 
 #include <algorithm>
 #include <cstddef>
 
-namespace vdbtools {
+namespace trk {
 
 /// Statistics of a cube of M^3 cells over its (M+1)^3 vertices. `mean` and `squares` (the sum of
 /// squared deviations from it) weigh a vertex by the part of it inside the cube, so that cubes side
@@ -40,8 +40,7 @@ struct BrickChannel {
     const float* first;  ///< vertex at the cube's origin
 
     const float* row(size_t x, size_t y) const {
-        return first +
-               (x * trk::ExtinctionField::kBrickEdge + y) * trk::ExtinctionField::kBrickEdge;
+        return first + (x * ExtinctionField::kBrickEdge + y) * ExtinctionField::kBrickEdge;
     }
 };
 
@@ -125,4 +124,4 @@ inline Moments cubeMoments(const BrickChannel& brick, size_t size) {
     return m;
 }
 
-}  // namespace vdbtools
+}  // namespace trk

@@ -19,8 +19,6 @@
 namespace trk {
 namespace {
 
-constexpr float kInfinity = std::numeric_limits<float>::infinity();
-
 class Baker {
   public:
     Baker(const ExtinctionField& field, const BakeOptions& options)
@@ -32,18 +30,14 @@ class Baker {
         while (1 << shift_ < size_) {
             ++shift_;
         }
-        computeCubes();
     }
 
     BakedVolume bake() {
         planSuperVoxels();
         moments_.resize(jobs_.size() * channels_);
         corners_.resize(moments_.size());
-        forEach(jobs_.size(), [&](size_t i) {
-            for (size_t c = 0; c < channels_; ++c) {
-                moments_[i * channels_ + c] = momentsOf(jobs_[i], c);
-                corners_[i * channels_ + c] = cornersOf(jobs_[i], c);
-            }
+        withEdge(static_cast<size_t>(cube_), [&](auto edge) {
+            forEach(jobs_.size(), [&](size_t i) { measure<decltype(edge)::value>(i); });
         });
         baked_.superVoxelShift = shift_;
         baked_.channels = channels_;
@@ -68,32 +62,6 @@ class Baker {
     template <class Body>
     static void forEach(size_t count, const Body& body) {
         parallelFor(count, 32, body);
-    }
-
-    /// Moments of every cube of every brick: each vertex is read once, whatever shares its brick.
-    void computeCubes() {
-        const auto edge = static_cast<size_t>(cube_);
-        const size_t perAxis = 8 / edge;
-        const size_t cubesPerBrick = perAxis * perAxis * perAxis;
-        cubes_.resize(field_.brickCount() * cubesPerBrick * channels_);
-        cubeCorners_.resize(cubes_.size());
-        forEach(field_.brickCount(), [&](size_t b) {
-            float vertices[ExtinctionField::kBrickVertices];
-            for (size_t c = 0; c < channels_; ++c) {
-                for (size_t i = 0; i < ExtinctionField::kBrickVertices; ++i) {
-                    vertices[i] = field_.vertex(static_cast<Entry>(b + 1), i, c);
-                }
-                for (size_t k = 0; k < cubesPerBrick; ++k) {
-                    const size_t x = k / (perAxis * perAxis) * edge;
-                    const size_t y = k / perAxis % perAxis * edge;
-                    const size_t z = k % perAxis * edge;
-                    const BrickChannel brick{BrickChannel{vertices}.row(x, y) + z};
-                    const size_t cube = (b * cubesPerBrick + k) * channels_ + c;
-                    cubes_[cube] = cubeMoments(brick, edge);
-                    cubeCorners_[cube] = cornerMoments(brick, edge);
-                }
-            }
-        });
     }
 
     /// Which super-voxels there are, equal ones once: their places in `jobs_`, in `plan_` the index
@@ -128,71 +96,79 @@ class Baker {
             });
     }
 
-    /// Calls body(cube's origin in the super-voxel, brick entry, cube's origin in the brick) for
-    /// every cube of a super-voxel.
+    /// A cube of a super-voxel.
+    struct Cube {
+        Int3 offset;    ///< in the super-voxel
+        Entry entry;    ///< of the field, there
+        size_t vertex;  ///< its first one in that brick
+    };
+
+    /// Calls body(cube) for every cube of a super-voxel: what of it lies in one brick.
     template <class Body>
     void forEachCube(const Int3& origin, const Body& body) const {
+        constexpr auto kEdge = static_cast<int64_t>(ExtinctionField::kBrickEdge);
         for (int64_t x = 0; x < size_; x += cube_) {
             for (int64_t y = 0; y < size_; y += cube_) {
                 for (int64_t z = 0; z < size_; z += cube_) {
                     const Int3 at{{origin[0] + x, origin[1] + y, origin[2] + z}};
-                    const Entry entry = field_.table().find(at[0], at[1], at[2]).entry;
-                    body(Int3{{x, y, z}}, entry, Int3{{at[0] & 7, at[1] & 7, at[2] & 7}});
+                    const int64_t vertex =
+                        ((at[0] & 7) * kEdge + (at[1] & 7)) * kEdge + (at[2] & 7);
+                    body(Cube{{{x, y, z}},
+                              field_.table().find(at[0], at[1], at[2]).entry,
+                              static_cast<size_t>(vertex)});
                 }
             }
         }
     }
 
-    /// Index of a brick's cube and channel.
-    size_t cubeIndex(Entry entry, const Int3& inBrick, size_t channel) const {
-        const int64_t perAxis = 8 / cube_;
-        const int64_t within =
-            (inBrick[0] / cube_ * perAxis + inBrick[1] / cube_) * perAxis + inBrick[2] / cube_;
-        const size_t cube = (entry - 1) * static_cast<size_t>(perAxis * perAxis * perAxis) +
-                            static_cast<size_t>(within);
-        return cube * channels_ + channel;
-    }
-    Moments cubeAt(Entry entry, const Int3& inBrick, size_t channel) const {
-        return ExtinctionField::isConstant(entry) ? constantMoments(field_.constant(entry)[channel])
-                                                  : cubes_[cubeIndex(entry, inBrick, channel)];
-    }
-
-    Moments momentsOf(const Int3& origin, size_t channel) const {
-        Moments all;
-        all.min = kInfinity;
-        forEachCube(origin, [&](const Int3&, Entry entry, const Int3& inBrick) {
-            const Moments m = cubeAt(entry, inBrick, channel);
-            all.min = std::min(all.min, m.min);
-            all.max = std::max(all.max, m.max);
-            all.mean += m.mean;
-        });
-        if (all.min == all.max) {
-            return constantMoments(all.min);
+    /// The first vertex of a cube in one channel, as cubeRow wants it.
+    const float* verticesOf(const Cube& cube, size_t channel,
+                            float (&buffer)[ExtinctionField::kBrickVertices]) const {
+        if (ExtinctionField::isConstant(cube.entry)) {
+            std::fill(std::begin(buffer), std::end(buffer), field_.constant(cube.entry)[channel]);
+            return buffer;
         }
-        all.mean /= std::pow(size_ / cube_, 3);
-        const auto cells = static_cast<double>(cube_ * cube_ * cube_);
-        forEachCube(origin, [&](const Int3&, Entry entry, const Int3& inBrick) {
-            const Moments m = cubeAt(entry, inBrick, channel);  // [Chan, Golub, LeVeque 1979]
-            all.squares += m.squares + cells * (m.mean - all.mean) * (m.mean - all.mean);
-        });
-        return all;
+        return field_.brickChannel(cube.entry, channel, buffer) + cube.vertex;
     }
 
-    CornerMoments cornersOf(const Int3& origin, size_t channel) const {
-        CornerMoments all{};
-        const double share = 1 / std::pow(size_ / cube_, 3);
-        forEachCube(origin, [&](const Int3& offset, Entry entry, const Int3& inBrick) {
-            addCorners(ExtinctionField::isConstant(entry)
-                           ? constantCorners(field_.constant(entry)[channel])
-                           : cubeCorners_[cubeIndex(entry, inBrick, channel)],
-                       offset, share, all);
-        });
-        return all;
+    /// Moments of a job, in every channel.
+    template <size_t M>
+    void measure(size_t job) {
+        for (size_t c = 0; c < channels_; ++c) {
+            Moments& all = moments_[job * channels_ + c];
+            CornerMoments& corners = corners_[job * channels_ + c];
+            double count = 0;
+            forEachCube(jobs_[job], [&](const Cube& cube) {
+                float buffer[ExtinctionField::kBrickVertices];
+                CornerMoments part;
+                add(cubeMoments<M>(verticesOf(cube, c, buffer), part), count++, all);
+                addCorners(part, cube.offset, corners);
+            });
+        }
+    }
+
+    /// Adds a cube to `count` others of equal size [Chan, Golub, LeVeque 1979].
+    void add(const Moments& cube, double count, Moments& all) const {
+        if (count == 0) {
+            all = cube;
+            return;
+        }
+        all.min = std::min(all.min, cube.min);
+        all.max = std::max(all.max, cube.max);
+        const double off = cube.mean - all.mean;
+        const double cells = cube_ * cube_ * cube_;
+        all.squares += cube.squares + cells * off * off * count / (count + 1);
+        all.mean += off / (count + 1);
     }
 
     /// The super-voxel's hat functions are multilinear in each of its cubes too.
-    void addCorners(const CornerMoments& cube, const Int3& offset, double scale,
-                    CornerMoments& sum) const {
+    void addCorners(const CornerMoments& cube, const Int3& offset, CornerMoments& sum) const {
+        if (cube_ == size_) {
+            sum = cube;
+            return;
+        }
+        const double perAxis = static_cast<double>(size_) / cube_;
+        const double scale = 1 / (perAxis * perAxis * perAxis);
         double hat[3][2][2];  // axis, corner of the super-voxel, corner of the cube
         for (size_t a = 0; a < 3; ++a) {
             for (size_t k = 0; k < 2; ++k) {
@@ -386,46 +362,25 @@ class Baker {
     /// Bound and RMS of what a control that is not constant leaves, vertex by vertex.
     void compareWithControl(const Int3& origin, size_t channel, const ControlPolynomial& control,
                             BakedSuperVoxel& v) const {
-        double majorant = 0;
-        double squares = 0;
-        const auto edge = static_cast<size_t>(cube_);
-        constexpr size_t kEdge = ExtinctionField::kBrickEdge;
-        forEachCube(origin, [&](const Int3& offset, Entry entry, const Int3& inBrick) {
-            const auto unit = [&](size_t axis, size_t i) {
-                return (static_cast<double>(offset[axis]) + static_cast<double>(i)) / size_ - 0.5;
-            };
-            std::array<double, kEdge> row{};
-            if (ExtinctionField::isConstant(entry)) {
-                row.fill(static_cast<double>(field_.constant(entry)[channel]));
-            }
-            for (size_t x = 0; x <= edge; ++x) {
-                for (size_t y = 0; y <= edge; ++y) {
-                    const size_t first = ((static_cast<size_t>(inBrick[0]) + x) * kEdge +
-                                          static_cast<size_t>(inBrick[1]) + y) *
-                                             kEdge +
-                                         static_cast<size_t>(inBrick[2]);
-                    for (size_t z = 0; z <= edge && !ExtinctionField::isConstant(entry); ++z) {
-                        row[z] = static_cast<double>(field_.vertex(entry, first + z, channel));
-                    }
-                    // Linear along a row, whatever the kind.
-                    const double ux = unit(0, x);
-                    const double uy = unit(1, y);
-                    const double start = control.at({{ux, uy, unit(2, 0)}});
-                    const double step = control.slopeZ(ux, uy) / size_;
-                    double sum = 0;
-                    for (size_t z = 0; z <= edge; ++z) {
-                        const double residual = row[z] - (start + step * static_cast<double>(z));
-                        majorant = std::max(majorant, std::fabs(residual));
-                        sum += trapezoid(z, edge) * residual * residual;
-                    }
-                    squares += trapezoid(x, edge) * trapezoid(y, edge) * sum;
+        ResidualMoments residual;
+        withEdge(static_cast<size_t>(cube_), [&](auto edge) {
+            constexpr size_t kEdge = decltype(edge)::value;
+            forEachCube(origin, [&](const Cube& cube) {
+                float buffer[ExtinctionField::kBrickVertices];
+                Vec3d start;
+                for (int a = 0; a < 3; ++a) {
+                    start[a] =
+                        static_cast<double>(cube.offset[static_cast<size_t>(a)]) / size_ - 0.5;
                 }
-            }
+                addResidual<kEdge>(verticesOf(cube, channel, buffer), control, start, 1.0 / size_,
+                                   residual);
+            });
         });
         // Whoever evaluates the control again may round differently.
         const double rounding = 1e-15 * (static_cast<double>(v.max) + control.max());
-        v.majorant = roundUp(majorant + rounding);
-        v.rms = std::min(roundUp(std::sqrt(squares / std::pow(size_, 3)) + rounding), v.majorant);
+        v.majorant = roundUp(residual.majorant + rounding);
+        v.rms = std::min(roundUp(std::sqrt(residual.squares / std::pow(size_, 3)) + rounding),
+                         v.majorant);
     }
 
     const ExtinctionField& field_;
@@ -434,8 +389,6 @@ class Baker {
     int size_;
     int cube_;
     int shift_ = 0;
-    std::vector<Moments> cubes_;              // of each brick's cubes and their channels
-    std::vector<CornerMoments> cubeCorners_;  // the same, where a fit asks for them
     SparseTable plan_;
     std::vector<Int3> jobs_;        // origins, local
     std::vector<Moments> moments_;  // of each job and channel

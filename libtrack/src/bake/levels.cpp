@@ -96,18 +96,19 @@ ValueTable meansOf(const ExtinctionField& field, int shift) {
     const size_t cubes = perAxis * perAxis * perAxis;
     std::vector<float> brickMeans(field.brickCount() * cubes * channels);
     parallelFor(field.brickCount(), 32, [&](size_t b) {
-        float vertices[ExtinctionField::kBrickVertices];
+        float buffer[ExtinctionField::kBrickVertices];
         for (size_t c = 0; c < channels; ++c) {
-            for (size_t i = 0; i < ExtinctionField::kBrickVertices; ++i) {
-                vertices[i] = field.vertex(static_cast<SparseTable::Entry>(b + 1), i, c);
-            }
-            for (size_t k = 0; k < cubes; ++k) {
-                const BrickChannel brick{BrickChannel{vertices}.row(k / (perAxis * perAxis) * edge,
-                                                                    k / perAxis % perAxis * edge) +
-                                         k % perAxis * edge};
-                brickMeans[(b * cubes + k) * channels + c] =
-                    static_cast<float>(cubeMean(brick, edge));
-            }
+            const float* brick =
+                field.brickChannel(static_cast<SparseTable::Entry>(b + 1), c, buffer);
+            withEdge(edge, [&](auto m) {
+                for (size_t k = 0; k < cubes; ++k) {
+                    const float* cube = cubeRow(brick, k / (perAxis * perAxis) * edge,
+                                                k / perAxis % perAxis * edge) +
+                                        k % perAxis * edge;
+                    brickMeans[(b * cubes + k) * channels + c] =
+                        static_cast<float>(cubeMean<decltype(m)::value>(cube));
+                }
+            });
         }
     });
     ValueTable means;

@@ -1,12 +1,16 @@
 // SPDX-License-Identifier: Apache-2.0
-// Statistics of cubes of cells of one brick, in one channel.
+// Statistics of cubes of cells of one brick, in one channel. Vertices are summed column by column,
+// which the compiler turns into vector code; the order is always the same.
 #pragma once
 
+#include "../control_shape.h"
 #include "../extinction_field.h"
 #include "control_fit.h"
 
 #include <algorithm>
+#include <cmath>
 #include <cstddef>
+#include <type_traits>
 
 namespace trk {
 
@@ -31,97 +35,150 @@ inline CornerMoments constantCorners(float value) {
 }
 
 /// The weight of vertex `i` of `last` + 1 on a line.
-inline double trapezoid(size_t i, size_t last) {
+constexpr double trapezoid(size_t i, size_t last) {
     return i == 0 || i == last ? 0.5 : 1.0;
 }
 
-/// One channel of a brick of the field, or of a part of one.
-struct BrickChannel {
-    const float* first;  ///< vertex at the cube's origin
-
-    const float* row(size_t x, size_t y) const {
-        return first + (x * ExtinctionField::kBrickEdge + y) * ExtinctionField::kBrickEdge;
+/// Calls f(std::integral_constant<size_t, edge>) for an edge of cubes: 1, 2, 4 or 8.
+template <class F>
+auto withEdge(size_t edge, const F& f) {
+    switch (edge) {
+        case 1:
+            return f(std::integral_constant<size_t, 1>{});
+        case 2:
+            return f(std::integral_constant<size_t, 2>{});
+        case 4:
+            return f(std::integral_constant<size_t, 4>{});
+        default:
+            return f(std::integral_constant<size_t, 8>{});
     }
-};
-
-inline CornerMoments cornerMoments(const BrickChannel& brick, size_t size) {
-    CornerMoments corners{};
-    const auto n = static_cast<double>(size);
-    for (size_t x = 0; x <= size; ++x) {
-        double plane[4] = {0, 0, 0, 0};  // by corner in y and z
-        for (size_t y = 0; y <= size; ++y) {
-            const float* row = brick.row(x, y);
-            double sum = 0.5 * (static_cast<double>(row[0]) + static_cast<double>(row[size]));
-            double upper = 0.5 * static_cast<double>(row[size]);
-            for (size_t z = 1; z < size; ++z) {
-                sum += static_cast<double>(row[z]);
-                upper += static_cast<double>(row[z]) * (static_cast<double>(z) / n);
-            }
-            const double weight = trapezoid(y, size);
-            const double up = static_cast<double>(y) / n;
-            plane[0] += weight * (1 - up) * (sum - upper);
-            plane[1] += weight * (1 - up) * upper;
-            plane[2] += weight * up * (sum - upper);
-            plane[3] += weight * up * upper;
-        }
-        const double weight = trapezoid(x, size) / (n * n * n);
-        const double up = static_cast<double>(x) / n;
-        for (size_t k = 0; k < 4; ++k) {
-            corners[k] += weight * (1 - up) * plane[k];
-            corners[4 + k] += weight * up * plane[k];
-        }
-    }
-    return corners;
 }
 
-/// The sum of term(value) over the vertices of a cube of a brick, weighed by their part inside.
-template <class Term>
-double weightedSum(const BrickChannel& brick, size_t size, const Term& term) {
-    double sum = 0;
-    for (size_t x = 0; x <= size; ++x) {
-        double plane = 0;
-        for (size_t y = 0; y <= size; ++y) {
-            const float* row = brick.row(x, y);
-            double line = 0.5 * (term(row[0]) + term(row[size]));
-            for (size_t z = 1; z < size; ++z) {
-                line += term(row[z]);
+/// The first vertex of a row of a cube, given the cube's own, of a channel as
+/// ExtinctionField::brickChannel gives it.
+inline const float* cubeRow(const float* cube, size_t x, size_t y) {
+    return cube + (x * ExtinctionField::kBrickEdge + y) * ExtinctionField::kBrickEdge;
+}
+
+/// The sum of weight x term(value, z) over the vertices of a cube of M^3 cells; f(x, y, row) gives
+/// the term of a row.
+template <size_t M, class TermOf>
+double weightedSum(const float* cube, const TermOf& termOf) {
+    double columns[M + 1] = {};
+    for (size_t x = 0; x <= M; ++x) {
+        for (size_t y = 0; y <= M; ++y) {
+            const float* row = cubeRow(cube, x, y);
+            const double weight = trapezoid(x, M) * trapezoid(y, M);
+            const auto term = termOf(x, y);
+            for (size_t z = 0; z <= M; ++z) {
+                columns[z] += weight * term(static_cast<double>(row[z]), z);
             }
-            plane += trapezoid(y, size) * line;
         }
-        sum += trapezoid(x, size) * plane;
+    }
+    double sum = 0.5 * (columns[0] + columns[M]);
+    for (size_t z = 1; z < M; ++z) {
+        sum += columns[z];
     }
     return sum;
 }
 
-/// The mean over a cube of `size`^3 cells of a brick; of equal values, that very value.
-inline double cubeMean(const BrickChannel& brick, size_t size) {
-    return weightedSum(brick, size, [](float v) { return static_cast<double>(v); }) /
-           static_cast<double>(size * size * size);
+/// The mean over a cube of M^3 cells; of equal values, that very value.
+template <size_t M>
+double cubeMean(const float* cube) {
+    return weightedSum<M>(
+               cube, [](size_t, size_t) { return [](double value, size_t) { return value; }; }) /
+           static_cast<double>(M * M * M);
 }
 
-/// Moments of one cube of `size`^3 cells of a brick. Two passes over values that are in L1:
+/// Moments of a cube of M^3 cells, and those of its corners. Two passes over values that are in L1:
 /// deviations from the mean do not cancel.
-inline Moments cubeMoments(const BrickChannel& brick, size_t size) {
+template <size_t M>
+Moments cubeMoments(const float* cube, CornerMoments& corners) {
+    constexpr auto kEdge = static_cast<double>(M);
     Moments m;
-    m.min = m.max = *brick.first;
-    for (size_t x = 0; x <= size; ++x) {
-        for (size_t y = 0; y <= size; ++y) {
-            const float* row = brick.row(x, y);
-            for (size_t z = 0; z <= size; ++z) {
-                m.min = std::min(m.min, row[z]);
-                m.max = std::max(m.max, row[z]);
+    float lo[M + 1];
+    float hi[M + 1];
+    std::copy_n(cube, M + 1, lo);
+    std::copy_n(cube, M + 1, hi);
+    double columns[4][M + 1] = {};  // by corner in x and y
+    for (size_t x = 0; x <= M; ++x) {
+        double plane[2][M + 1] = {};  // by corner in y, the upper one; and both
+        for (size_t y = 0; y <= M; ++y) {
+            const float* row = cubeRow(cube, x, y);
+            const double weight = trapezoid(y, M);
+            const double upper = weight * static_cast<double>(y) / kEdge;
+            for (size_t z = 0; z <= M; ++z) {
+                lo[z] = row[z] < lo[z] ? row[z] : lo[z];
+                hi[z] = row[z] > hi[z] ? row[z] : hi[z];
+                const auto value = static_cast<double>(row[z]);
+                plane[0][z] += upper * value;
+                plane[1][z] += weight * value;
             }
         }
+        const double upper = trapezoid(x, M) * static_cast<double>(x) / kEdge;
+        const double lower = trapezoid(x, M) - upper;
+        for (size_t z = 0; z <= M; ++z) {
+            const double lowerPlane = plane[1][z] - plane[0][z];
+            columns[0][z] += lower * lowerPlane;
+            columns[1][z] += lower * plane[0][z];
+            columns[2][z] += upper * lowerPlane;
+            columns[3][z] += upper * plane[0][z];
+        }
     }
+    m.min = *std::min_element(lo, lo + M + 1);
+    m.max = *std::max_element(hi, hi + M + 1);
     if (m.min == m.max) {
+        corners = constantCorners(m.min);
         return constantMoments(m.min);
     }
-    m.mean = cubeMean(brick, size);
-    m.squares = weightedSum(brick, size, [&](float v) {
-        const double d = static_cast<double>(v) - m.mean;
-        return d * d;
+    for (size_t k = 0; k < 4; ++k) {
+        const double* column = columns[k];
+        double sum = 0.5 * (column[0] + column[M]);
+        double upper = 0.5 * column[M];
+        for (size_t z = 1; z < M; ++z) {
+            sum += column[z];
+            upper += column[z] * (static_cast<double>(z) / kEdge);
+        }
+        corners[2 * k] = (sum - upper) / (kEdge * kEdge * kEdge);
+        corners[2 * k + 1] = upper / (kEdge * kEdge * kEdge);
+    }
+    for (const double corner : corners) {
+        m.mean += corner;
+    }
+    m.squares = weightedSum<M>(cube, [&](size_t, size_t) {
+        return [&](double value, size_t) { return (value - m.mean) * (value - m.mean); };
     });
     return m;
+}
+
+/// What a control leaves of a cube's vertices.
+struct ResidualMoments {
+    double majorant = 0;
+    double squares = 0;  ///< weighed as in Moments
+};
+
+/// Adds a cube of M^3 cells, whose first vertex lies at `start` of the control's super-voxel, in
+/// [-1/2, 1/2]^3, its vertices `step` apart.
+template <size_t M>
+void addResidual(const float* cube, const ControlPolynomial& control, const Vec3d& start,
+                 double step, ResidualMoments& residual) {
+    double largest[M + 1] = {};
+    residual.squares += weightedSum<M>(cube, [&](size_t x, size_t y) {
+        // Linear along a row, whatever the kind.
+        const double ux = start[0] + step * static_cast<double>(x);
+        const double uy = start[1] + step * static_cast<double>(y);
+        const double first = control.at({{ux, uy, start[2]}});
+        const double slope = control.slopeZ(ux, uy) * step;
+        return [first, slope, &largest](double value, size_t z) {
+            const double r = value - (first + slope * static_cast<double>(z));
+            const double size = std::fabs(r);
+            largest[z] = size > largest[z] ? size : largest[z];
+            return r * r;
+        };
+    });
+    for (const double l : largest) {
+        residual.majorant = std::max(residual.majorant, l);
+    }
 }
 
 }  // namespace trk

@@ -3,7 +3,6 @@
 #include "command_line.h"
 
 #include "bake/bake.h"
-#include "bake/levels.h"
 #include "io/density.h"
 #include "io/sidecar.h"
 
@@ -85,24 +84,15 @@ void run(const Command& command, const std::vector<std::string>& given) {
     const trk::DensitySummary& summary = density.summary;
     trk::BakedVolume baked;
     trk::SidecarHeader header;
-    // Controls that vary have more grids: no reason to have no picture.
-    const uint64_t limit = trk::sidecarLimit(summary.fileBytes) +
-                           (bakeOptions.kind == trk::ControlKind::kConstant ? 0 : 40000);
     {
         const Progress progress(arguments, "baking " + input);
-        bakeOptions.sidecarBytes = limit;
+        bakeOptions.sidecarBytes = trk::sidecarLimit(summary.fileBytes, bakeOptions.kind);
         baked = trk::bake(density.field, bakeOptions);
-        header = trk::sidecarHeader(summary, density.field, baked);
     }
     const double bakeTime = seconds() - readTime;
     {
         const Progress progress(arguments, "writing " + output);
-        trk::writeSidecar(file, header, baked, summary.anchor);
-        // How well values compress was an estimate.
-        while (baked.previewSize > 0 && std::filesystem::file_size(file.path()) > limit) {
-            trk::coarsenPreview(baked, density.field);
-            trk::writeSidecar(file, header, baked, summary.anchor);
-        }
+        header = trk::writeBake(file, summary, density.field, baked, bakeOptions.sidecarBytes);
         file.commit();
     }
     if (baked.items.empty() && !arguments.quiet()) {

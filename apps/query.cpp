@@ -349,6 +349,7 @@ Inputs inputsOf(const Arguments& arguments, const TrkQuery& query,
         inputs.sidecarPath = trk::defaultSidecarPath(inputs.density);
     }
     const bool useSidecar = !densityAlone || arguments.has("sidecar");
+    inputs.options.noBake = densityAlone ? 1 : 0;
     if (!useSidecar) {
         inputs.options.repair |= repairBeside(inputs.sidecarPath);
     }
@@ -380,8 +381,8 @@ trk::Volume openInside(const Inputs& inputs) {
     options.choice = inputs.options.choice;
     options.global = inputs.options.global != 0;
     options.repair = inputs.options.repair;
+    options.bakeMissing = true;
     trk::Volume volume = trk::openVolume(inputs.density.c_str(), inputs.sidecar(), options);
-    trk::requireSuperVoxels(volume, ", or use TRK_METHOD_EXACT");
     return volume;
 }
 

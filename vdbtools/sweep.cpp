@@ -364,7 +364,7 @@ SweepBake bakeInto(Volumes::Bakes& bakes, const Source& source, int size, Contro
     trk::BakeOptions options;
     options.superVoxelSize = size;
     options.kind = kind;
-    options.sidecarBytes = trk::sidecarLimit(source.summary.fileBytes);
+    options.sidecarBytes = trk::sidecarLimit(source.summary.fileBytes, kind);
     const auto start = std::chrono::steady_clock::now();
     trk::BakedVolume& baked = bakes[{size, kind}] = trk::bake(*source.field, options);
     SweepBake result;

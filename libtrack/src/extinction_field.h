@@ -101,8 +101,8 @@ class ExtinctionField {
         return isHalf() ? decodeHalf(halfs_[at]) : floats_[at];
     }
 
-    /// All vertices of one channel of brick `entry`, x slowest: in place where they lie side by side
-    /// as floats, else in `buffer`.
+    /// All vertices of one channel of brick `entry`, x slowest: in place where they lie side by
+    /// side as floats, else in `buffer`.
     const float* brickChannel(Entry entry, size_t channel, float (&buffer)[kBrickVertices]) const {
         const size_t first = (entry - 1) * kBrickVertices * channels_ + channel;
         if (!isHalf() && channels_ == 1) {

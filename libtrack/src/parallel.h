@@ -1,7 +1,9 @@
 // SPDX-License-Identifier: Apache-2.0
 // Loops over TBB, in a task group of their own: one that the caller of the library cancels would
-// otherwise end ours in the middle, without a word.
+// otherwise end ours in the middle, without a word. They tell whoever listens to Progress.
 #pragma once
+
+#include "progress.h"
 
 #include <tbb/blocked_range.h>
 #include <tbb/parallel_for.h>
@@ -27,7 +29,10 @@ void parallelRanges(size_t count, size_t grain, const Body& body) {
     tbb::task_group_context context(tbb::task_group_context::isolated);
     tbb::parallel_for(
         tbb::blocked_range<size_t>(0, count, grain),
-        [&](const tbb::blocked_range<size_t>& range) { body(range.begin(), range.end()); },
+        [&](const tbb::blocked_range<size_t>& range) {
+            Progress::poll();
+            body(range.begin(), range.end());
+        },
         context);
 }
 
@@ -48,6 +53,7 @@ Part parallelSum(size_t count, size_t grain, const Body& body) {
     return tbb::parallel_reduce(
         tbb::blocked_range<size_t>(0, count, grain), Part{},
         [&](const tbb::blocked_range<size_t>& range, Part part) {
+            Progress::poll();
             for (size_t i = range.begin(); i != range.end(); ++i) {
                 body(i, part);
             }

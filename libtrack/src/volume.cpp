@@ -1,9 +1,11 @@
 // SPDX-License-Identifier: Apache-2.0
 #include "volume.h"
 
+#include "bake/bake.h"
 #include "failure.h"
 #include "io/density.h"
 #include "io/sidecar.h"
+#include "progress.h"
 
 #include <algorithm>
 #include <cmath>
@@ -117,6 +119,7 @@ std::string defaultSidecarPath(const std::string& vdbPath) {
 Volume makeVolume(const DensitySummary& summary, std::shared_ptr<const ExtinctionField> field,
                   const VolumeOptions& options) {
     Volume volume;
+    volume.options = options;
     volume.scales = channelScales(options, field->channels());
     checkScale(volume.scales, "density", static_cast<double>(summary.max), summary.path);
     volume.grid = summary.grid;
@@ -125,6 +128,7 @@ Volume makeVolume(const DensitySummary& summary, std::shared_ptr<const Extinctio
     volume.anchor = summary.anchor;
     volume.activeVoxels = summary.activeVoxels;
     volume.field = std::move(field);
+    volume.density = std::make_shared<const DensitySummary>(summary);
     return volume;
 }
 
@@ -156,6 +160,14 @@ void addSuperVoxels(Volume& volume, BakedVolume baked, const VolumeOptions& opti
     volume.hasSuperVoxels = true;
 }
 
+void bakeInMemory(Volume& volume, const VolumeOptions& options) {
+    const Progress::Stage stage(0.8, 1);
+    BakeOptions bakeOptions;
+    bakeOptions.maxMemory = options.maxMemory;
+    bakeOptions.gradients = false;
+    addSuperVoxels(volume, bake(*volume.field, bakeOptions), options, volume.density->path);
+}
+
 Volume openVolume(const char* vdbPath, const char* sidecarPath, const VolumeOptions& options) {
     const bool named = sidecarPath != nullptr && *sidecarPath != '\0';
     const bool wanted = sidecarPath == nullptr || named;
@@ -180,6 +192,7 @@ Volume openVolume(const char* vdbPath, const char* sidecarPath, const VolumeOpti
     if (vdbPath == nullptr) {
         sidecar =
             readSidecar(path, nullptr, options.check, SidecarParts::kQueries, options.maxMemory);
+        volume.options = options;
         volume.grid = sidecar.header.source;
         if (options.gridNamed && options.gridName != volume.grid.name &&
             options.gridName != volume.grid.name + "[" + std::to_string(volume.grid.index) + "]") {
@@ -197,7 +210,11 @@ Volume openVolume(const char* vdbPath, const char* sidecarPath, const VolumeOpti
         densityOptions.gridName = options.gridName;
         densityOptions.repair = options.repair | (haveSidecar ? sidecar.header.repair : 0u);
         densityOptions.maxMemory = options.maxMemory;
-        Density density = loadDensity(vdbPath, densityOptions);
+        Density density;
+        {
+            const Progress::Stage reading(0, 0.8);
+            density = loadDensity(vdbPath, densityOptions);
+        }
         volume =
             makeVolume(density.summary,
                        std::make_shared<const ExtinctionField>(std::move(density.field)), options);
@@ -209,9 +226,58 @@ Volume openVolume(const char* vdbPath, const char* sidecarPath, const VolumeOpti
     volume.sidecarPath = path;
     if (haveSidecar) {
         addSuperVoxels(volume, std::move(sidecar.baked), options, path);
+    } else if (options.bakeMissing) {
+        bakeInMemory(volume, options);
     }
     checkMemory(volume.bytes(), options.maxMemory, vdbPath ? vdbPath : volume.sidecarPath);
     return volume;
+}
+
+Volume makeVolume(const TrkDensity& given, const VolumeOptions& options) {
+    Volume volume;
+    {
+        const Progress::Stage reading(0, 0.8);
+        Density density = makeDensity(given, options.repair, options.maxMemory);
+        volume =
+            makeVolume(density.summary,
+                       std::make_shared<const ExtinctionField>(std::move(density.field)), options);
+    }
+    if (options.bakeMissing) {
+        bakeInMemory(volume, options);
+    }
+    checkMemory(volume.bytes(), options.maxMemory, volume.density->path);
+    return volume;
+}
+
+void bakeVolume(Volume& volume, BakeOptions options, const char* path, bool overwrite) {
+    if (!volume.hasDensity()) {
+        throw Error(TRK_ERROR_NO_DENSITY, volume.sidecarPath +
+                                              ": opened without its density, which a bake is of; "
+                                              "open the density's .vdb");
+    }
+    std::optional<OutputFile> file;
+    if (path) {
+        file.emplace(path, overwrite);
+        options.sidecarBytes = sidecarLimit(volume.density->fileBytes, options.kind);
+    }
+    options.gradients = path != nullptr;
+    Volume next = makeVolume(*volume.density, volume.field, volume.options);
+    BakedVolume baked;
+    {
+        const Progress::Stage baking(0, path ? 0.7 : 1);
+        baked = bake(*volume.field, options);
+    }
+    if (file) {
+        const Progress::Stage writing(0.7, 1);
+        writeBake(*file, *volume.density, *volume.field, baked, options.sidecarBytes);
+        next.sidecarPath = path;
+    }
+    addSuperVoxels(next, std::move(baked), volume.options, volume.density->path);
+    checkMemory(next.bytes(), options.maxMemory, volume.density->path);
+    if (file) {
+        file->commit();
+    }
+    volume = std::move(next);
 }
 
 }  // namespace trk

@@ -31,6 +31,7 @@ inline Int3 anchorFor(const IntBox& indexBox) {
     return anchor;
 }
 
+struct BakeOptions;
 struct DensitySummary;
 
 /// A grid's place in its file, as sidecars record it.
@@ -47,7 +48,21 @@ struct ClippedRay {
     double tPerVoxel = 1;
 };
 
+struct VolumeOptions {
+    std::string gridName;
+    bool gridNamed = false;
+    float scale = 1;
+    std::array<float, 3> color{{1, 1, 1}};
+    TrkChoice choice = TRK_CHOICE_ROBUST;
+    bool global = false;
+    TrkCheck check = TRK_CHECK_FULL;
+    bool bakeMissing = false;  ///< where there is no sidecar, bake in memory
+    uint32_t repair = 0;
+    uint64_t maxMemory = 0;
+};
+
 struct Volume {
+    VolumeOptions options;  ///< it was opened with
     AffineMap indexToWorld;
     AffineMap worldToIndex;
     Int3 anchor{{0, 0, 0}};
@@ -55,8 +70,10 @@ struct Volume {
     /// densities of three channels, and for those of one with a tint.
     std::vector<double> scales{1.0};
 
-    /// The density, which several volumes may share; NULL where only a sidecar is open.
+    /// The density, which several volumes may share, and what is known of its grid; NULL where only
+    /// a sidecar is open.
     std::shared_ptr<const ExtinctionField> field;
+    std::shared_ptr<const DensitySummary> density;
 
     bool hasSuperVoxels = false;
     SuperVoxels superVoxels;                      ///< as baked
@@ -139,18 +156,6 @@ class VolumeExtinction {
     std::array<double, C> scales_;
 };
 
-struct VolumeOptions {
-    std::string gridName;
-    bool gridNamed = false;
-    float scale = 1;
-    std::array<float, 3> color{{1, 1, 1}};
-    TrkChoice choice = TRK_CHOICE_ROBUST;
-    bool global = false;
-    TrkCheck check = TRK_CHECK_FULL;
-    uint32_t repair = 0;
-    uint64_t maxMemory = 0;
-};
-
 /// A volume of a density in memory, without super-voxels. Throws Error where the options' scale is
 /// too large for it.
 Volume makeVolume(const DensitySummary& summary, std::shared_ptr<const ExtinctionField> field,
@@ -162,6 +167,12 @@ void addSuperVoxels(Volume& volume, BakedVolume baked, const VolumeOptions& opti
 
 /// As trkOpenVolume: `vdbPath` may be NULL, `sidecarPath` NULL or empty. Throws Error.
 Volume openVolume(const char* vdbPath, const char* sidecarPath, const VolumeOptions& options);
+
+/// As trkMakeVolume. Throws Error.
+Volume makeVolume(const TrkDensity& density, const VolumeOptions& options);
+
+/// As trkBakeVolume: `path` may be NULL. Throws Error, and the volume is as it was.
+void bakeVolume(Volume& volume, BakeOptions options, const char* path, bool overwrite);
 
 /// NAME.vdb -> NAME.track.vdb; any other name gets the ending appended.
 std::string defaultSidecarPath(const std::string& vdbPath);

@@ -168,7 +168,9 @@ TEST(Api, RefusesBadQueriesBeforeWritingAnything) {
 }
 
 TEST(Api, SaysWhichFileAMethodLacks) {
-    const track::Volume bare = track::Volume::open(files().vdb, "");
+    TrkVolumeOptions options = trkDefaultVolumeOptions();
+    options.noBake = 1;
+    const track::Volume bare = track::Volume::open(files().vdb, "", options);
     const track::Volume alone = track::Volume::open("", files().sidecar.c_str());
     const TrkRay ray{{0, 0, 0}, 0, {1, 1, 1}, 100};
     float out = -1;
@@ -192,13 +194,15 @@ TEST(Api, SaysWhichFileAMethodLacks) {
 
 TEST(Api, FindsTheSidecarBesideTheDensity) {
     const std::string vdb = fixtures::write("beside.vdb", {fixtures::makeBlob(24)});
-    EXPECT_EQ(track::Volume::open(vdb).info().superVoxelSize, 0u);
-    fixtures::bake(vdb, fixtures::path("beside.track.vdb"), 16);
-    EXPECT_EQ(track::Volume::open(vdb).info().superVoxelSize, 16u);
+    TrkVolumeOptions options = trkDefaultVolumeOptions();
+    options.noBake = 1;
+    EXPECT_EQ(track::Volume::open(vdb, nullptr, options).info().superVoxelSize, 0u);
+    fixtures::bake(vdb, fixtures::path("beside.track.vdb"), 8);
+    EXPECT_EQ(track::Volume::open(vdb, nullptr, options).info().superVoxelSize, 8u);
     // After the density changed, the sidecar is refused, unless it is not wanted.
     fixtures::write("beside.vdb", {fixtures::makeBlob(25)});
     EXPECT_THROW(track::Volume::open(vdb), track::Error);
-    EXPECT_EQ(track::Volume::open(vdb, "").info().superVoxelSize, 0u);
+    EXPECT_EQ(track::Volume::open(vdb, "", options).info().superVoxelSize, 0u);
 }
 
 TEST(Api, EmptyIntervalsAndMissesGiveOne) {

@@ -163,12 +163,14 @@ TEST(Host, TheHeaderHasTheVersionOfTheLibrary) {
 
 // Padding would hold what happened to lie there, and a field of a later release could fall into it.
 TEST(Host, StructsAreFullOfFields) {
-    EXPECT_EQ(sizeof(TrkVolumeOptions), offsetof(TrkVolumeOptions, maxMemory) + sizeof(uint64_t));
+    EXPECT_EQ(sizeof(TrkVolumeOptions), offsetof(TrkVolumeOptions, progressData) + sizeof(void*));
+    EXPECT_EQ(sizeof(TrkBakeOptions), offsetof(TrkBakeOptions, progressData) + sizeof(void*));
+    EXPECT_EQ(sizeof(TrkDensity), offsetof(TrkDensity, tileActive) + sizeof(void*));
     EXPECT_EQ(sizeof(TrkQuery), offsetof(TrkQuery, resultStride) + sizeof(size_t));
     EXPECT_EQ(offsetof(TrkQuery, seed), offsetof(TrkQuery, threads) + sizeof(int32_t));
     EXPECT_EQ(sizeof(TrkVolumeInfo), offsetof(TrkVolumeInfo, storage) + sizeof(const char*));
     TrkVolumeOptions options = trkDefaultVolumeOptions();
-    options.reserved = 1;
+    options.noBake = 2;
     TrkVolume* volume = nullptr;
     EXPECT_EQ(trkOpenVolume("x.vdb", "", &options, &volume), TRK_ERROR_INVALID_ARGUMENT);
 }

@@ -79,7 +79,9 @@ TEST(Sampling, RefusesBadQueriesBeforeWritingAnything) {
                   TRK_ERROR_INVALID_ARGUMENT, "weightStride");
     EXPECT_EQ(trkSampleFreePath(volume.handle(), nullptr, nullptr, 0, nullptr), TRK_OK);
 
-    const track::Volume bare = track::Volume::open(cloud.vdb, "");
+    TrkVolumeOptions noBake = trkDefaultVolumeOptions();
+    noBake.noBake = 1;
+    const track::Volume bare = track::Volume::open(cloud.vdb, "", noBake);
     const track::Volume alone = track::Volume::open("", cloud.sidecar.c_str());
     expectRefused(trkSampleFreePath(bare.handle(), nullptr, all.data(), 1, &view),
                   TRK_ERROR_NO_SIDECAR, "sidecar");

@@ -289,7 +289,8 @@ TEST(Sidecar, OfASmallVolumeIsSmallWhereverThatLies) {
         const std::string vdb = fixtures::write("ball.vdb", {ballAt(20, offset)});
         const trk::Density density = fixtures::load(vdb);
         trk::BakeOptions options = fixtures::bakeOptions(16, 4);
-        options.sidecarBytes = trk::sidecarLimit(density.summary.fileBytes);
+        options.sidecarBytes =
+            trk::sidecarLimit(density.summary.fileBytes, trk::ControlKind::kConstant);
         const trk::BakedVolume baked = trk::bake(density.field, options);
         const std::string sidecar = fixtures::path("ball.track.vdb");
         trk::OutputFile file(sidecar, true);

@@ -48,7 +48,8 @@ enum {
     TRK_ERROR_NO_SIDECAR = 8,       /**< the method needs a sidecar and the volume has none */
     TRK_ERROR_NO_DENSITY = 9,       /**< the method needs the density; only a sidecar is open */
     TRK_ERROR_OUT_OF_MEMORY = 10,   /**< no memory left, or more than maxMemory wanted */
-    TRK_ERROR_UNKNOWN = 11
+    TRK_ERROR_UNKNOWN = 11,
+    TRK_ERROR_CANCELLED = 12 /**< the caller's progress function said so */
 };
 
 /** "TRK_OK", "TRK_ERROR_IO", …; "TRK_ERROR_UNKNOWN" for any other number. Static storage. */
@@ -66,8 +67,8 @@ TRK_API const char* trkGetLastErrorMessage(void);
  * of every field added after the first release. An older library takes a newer, larger struct where
  * all that it does not know is 0, and refuses it otherwise. TrkRay stays as it is. */
 
-/** An opened, immutable volume. Any number of threads may query one; only closing it must not run
- *  beside other calls on it. */
+/** An opened volume. Any number of threads may query one; only closing and baking it
+ *  must not run beside other calls on it. */
 typedef struct TrkVolume TrkVolume;
 
 /** The points origin + t direction, t in [tMin, tMax], in world space. The direction need not have
@@ -115,6 +116,20 @@ enum {
                                negative */
 };
 
+/** How the control of a bake varies within a super-voxel. */
+typedef int32_t TrkControlKind;
+enum {
+    TRK_CONTROL_CONSTANT = 0,  /**< the mean */
+    TRK_CONTROL_TRILINEAR = 1, /**< interpolated between corner values: continuous */
+    TRK_CONTROL_AFFINE = 2     /**< the mean and a gradient */
+};
+
+/** Called during a long call, in the thread that made the call, ten times a second at most: `share`
+ *  of the work is done, 0 to 1, never less than before. Answers 0 to go on; anything else ends the
+ *  call with TRK_ERROR_CANCELLED, well within a second. It may use other volumes; it must not throw
+ *  or jump out. */
+typedef int32_t (*TrkProgress)(void* data, float share);
+
 /** What opening a volume checks of its sidecar. */
 typedef int32_t TrkCheck;
 enum {
@@ -142,8 +157,13 @@ typedef struct TrkVolumeOptions {
     TrkCheck check;     /**< how far to distrust the sidecar */
     uint32_t repair;    /**< TRK_REPAIR_… bits; those the sidecar was baked with are added */
     int32_t threads;    /**< threads used for opening; 0: all */
-    uint32_t reserved;  /**< 0 */
+    uint32_t noBake;    /**< 1: a density without a sidecar stays without super-voxels, and what
+                             needs them fails with TRK_ERROR_NO_SIDECAR; 0: it gets a bake in
+                             memory, of the default TrkBakeOptions, for a part of what reading it
+                             takes */
     uint64_t maxMemory; /**< refuse to hold more bytes than this; 0: no limit */
+    TrkProgress progress; /**< or NULL */
+    void* progressData;   /**< handed to it */
 } TrkVolumeOptions;
 
 static inline TrkVolumeOptions trkDefaultVolumeOptions(void) {
@@ -157,9 +177,112 @@ static inline TrkVolumeOptions trkDefaultVolumeOptions(void) {
     options.check = TRK_CHECK_FULL;
     options.repair = 0;
     options.threads = 0;
+    options.noBake = 0;
+    options.maxMemory = 0;
+    options.progress = NULL;
+    options.progressData = NULL;
+    return options;
+}
+
+/** What to bake. Fill it with trkDefaultBakeOptions(), then change what you need. */
+typedef struct TrkBakeOptions {
+    size_t size;             /**< sizeof(TrkBakeOptions) */
+    uint32_t superVoxelSize; /**< edge in voxels: 4, 8, 16, 32 or 64 */
+    TrkControlKind control;
+    uint32_t levels;    /**< preview levels at most, each of super-voxels twice as large; 0 to 8 */
+    uint32_t overwrite; /**< 1: replace a file that is there; 0: fail */
+    int32_t threads;    /**< used for baking; 0: all */
+    uint32_t reserved;  /**< 0 */
+    uint64_t maxMemory; /**< refuse to hold more bytes than this, density included; 0: no limit */
+    TrkProgress progress; /**< or NULL */
+    void* progressData;   /**< handed to it */
+} TrkBakeOptions;
+
+static inline TrkBakeOptions trkDefaultBakeOptions(void) {
+    TrkBakeOptions options;
+    options.size = sizeof(TrkBakeOptions);
+    options.superVoxelSize = 16;
+    options.control = TRK_CONTROL_CONSTANT;
+    options.levels = 4;
+    options.overwrite = 0;
+    options.threads = 0;
     options.reserved = 0;
     options.maxMemory = 0;
+    options.progress = NULL;
+    options.progressData = NULL;
     return options;
+}
+
+/** Type of the values of a density in memory. */
+typedef int32_t TrkValueType;
+enum {
+    TRK_VALUE_FLOAT = 0,
+    TRK_VALUE_DOUBLE = 1,
+    TRK_VALUE_HALF = 2 /**< IEEE 754 binary16 */
+};
+
+/** A density in your memory: a dense array, or bricks of 8^3 voxels and tiles (what OpenVDB's trees
+ *  are made of; track_openvdb.hpp fills this in from a grid), or both empty. Everywhere else it is
+ *  0. All is copied; nothing is kept. Positions are integer index coordinates: voxel centres.
+ *  Fill it with trkDefaultDensity(), then say what you have. */
+typedef struct TrkDensity {
+    size_t size;             /**< sizeof(TrkDensity) */
+    const char* name;        /**< of the grid, for messages and sidecars; NULL: "density" */
+    TrkValueType valueType;  /**< of all values */
+    uint32_t channels;       /**< 1, or 3: one extinction a channel */
+    double indexToWorld[12]; /**< world = first nine (rows) x index + last three */
+
+    const void* values;    /**< dense: of the voxel at `origin`, or NULL */
+    int32_t origin[3];     /**< dense: index coordinates of the first voxel */
+    uint32_t reserved;     /**< 0 */
+    uint64_t extent[3];    /**< dense: voxels along x, y, z */
+    int64_t strides[3];    /**< dense: bytes from a voxel to the next along x, y, z; all 0: without
+                                gaps, x fastest */
+    int64_t channelStride; /**< dense: bytes from a channel to the next; 0: side by side */
+
+    size_t brickCount;
+    const int32_t* brickOrigins;    /**< x, y, z a brick: multiples of 8, no two alike */
+    const void* const* brickValues; /**< of each brick, 512 voxels without gaps, z fastest,
+                                         channels side by side */
+    const uint64_t* brickMasks;     /**< of each brick 8 words, a bit a voxel, set where it is
+                                         active; NULL: all are. Active or not, values count; a
+                                         sidecar fits what has the same masks */
+
+    size_t tileCount;
+    const int32_t* tileOrigins; /**< x, y, z a tile: multiples of its size */
+    const int32_t* tileSizes;   /**< edge in voxels: 8, 128 or 4096 */
+    const void* tileValues;     /**< of each tile, `channels` values */
+    const uint8_t* tileActive;  /**< of each tile 1 or 0; NULL: all are active */
+} TrkDensity;
+
+static inline TrkDensity trkDefaultDensity(void) {
+    TrkDensity density;
+    int i;
+    density.size = sizeof(TrkDensity);
+    density.name = NULL;
+    density.valueType = TRK_VALUE_FLOAT;
+    density.channels = 1;
+    for (i = 0; i < 12; ++i) {
+        density.indexToWorld[i] = i == 0 || i == 4 || i == 8 ? 1.0 : 0.0;
+    }
+    density.values = NULL;
+    density.reserved = 0;
+    for (i = 0; i < 3; ++i) {
+        density.origin[i] = 0;
+        density.extent[i] = 0;
+        density.strides[i] = 0;
+    }
+    density.channelStride = 0;
+    density.brickCount = 0;
+    density.brickOrigins = NULL;
+    density.brickValues = NULL;
+    density.brickMasks = NULL;
+    density.tileCount = 0;
+    density.tileOrigins = NULL;
+    density.tileSizes = NULL;
+    density.tileValues = NULL;
+    density.tileActive = NULL;
+    return density;
 }
 
 /** Bits of TrkQuery.flags. */
@@ -320,15 +443,33 @@ typedef struct TrkVolumeInfo {
 
 /** Opens a volume into *volume (NULL on failure); close it with trkCloseVolume.
  *  vdbPath: the density, or NULL to open a sidecar alone (TRK_METHOD_CONTROL only).
- *  sidecarPath: a file written by `vdbtrack bake`; NULL: NAME.track.vdb beside NAME.vdb if it
- * exists;
- *  "": none. A sidecar that does not fit the density is an error, never ignored.
+ *  sidecarPath: a file written by `vdbtrack bake` or trkBakeVolume; NULL: NAME.track.vdb beside
+ *  NAME.vdb if it exists; "": none. A sidecar that does not fit the density is an error, never
+ *  ignored; a density without one is baked in memory, unless options->noBake says no.
  *  options: NULL for the defaults.
  *  Fails with INVALID_ARGUMENT, IO, BAD_FILE, GRID_NOT_FOUND, UNSUPPORTED_GRID, BAD_DENSITY,
- *  SIDECAR_MISMATCH, OUT_OF_MEMORY. Runs on TBB, apart from the caller's own tasks: cancelling
- * those changes nothing here. Thread-safe. */
+ *  SIDECAR_MISMATCH, OUT_OF_MEMORY, CANCELLED. Runs on TBB, apart from the caller's own tasks:
+ * cancelling those changes nothing here. Thread-safe. */
 TRK_API TrkStatus trkOpenVolume(const char* vdbPath, const char* sidecarPath,
                                 const TrkVolumeOptions* options, TrkVolume** volume);
+
+/** Makes a volume of a density in memory, as trkOpenVolume would of a file with these voxels:
+ * queries have the same bits. It is baked in memory, unless options->noBake says no; trkBakeVolume
+ * bakes it otherwise. options: NULL for the defaults; gridName must be NULL, check is ignored.
+ *  Fails with INVALID_ARGUMENT (a pointer, count, origin or map that cannot be), BAD_DENSITY,
+ *  UNSUPPORTED_GRID (a map that is singular or not finite), OUT_OF_MEMORY, CANCELLED. Otherwise as
+ *  trkOpenVolume. */
+TRK_API TrkStatus trkMakeVolume(const TrkDensity* density, const TrkVolumeOptions* options,
+                                TrkVolume** volume);
+
+/** Bakes an open volume again, with other super-voxels or another control, and uses that from then
+ *  on. The volume must have its density, and no other call may use it meanwhile: bake before the
+ *  first query. options: NULL for the defaults. sidecarPath: where to write the bake, whole or not
+ *  at all, for trkOpenVolume and everything that reads .vdb files; NULL: nowhere.
+ *  Fails with INVALID_ARGUMENT, NO_DENSITY, IO, OUT_OF_MEMORY, CANCELLED; the volume is then as it
+ *  was. Runs on TBB as trkOpenVolume does. */
+TRK_API TrkStatus trkBakeVolume(TrkVolume* volume, const TrkBakeOptions* options,
+                                const char* sidecarPath);
 
 /** Releases a volume; NULL is allowed. No other call may use it any more. */
 TRK_API void trkCloseVolume(TrkVolume* volume);

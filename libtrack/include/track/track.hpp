@@ -13,11 +13,13 @@
 
 namespace track {
 
-/// A failed call: its status and the line of trkGetLastErrorMessage().
+/// A failed call: its status and the line that says what was found.
 class Error : public std::runtime_error {
   public:
     explicit Error(TrkStatus status)
         : std::runtime_error(trkGetLastErrorMessage()), status_(status) {}
+    Error(TrkStatus status, const std::string& message)
+        : std::runtime_error(message), status_(status) {}
     TrkStatus status() const noexcept { return status_; }
 
   private:
@@ -86,7 +88,7 @@ struct FreePaths {
     }
 };
 
-/// Owns a TrkVolume. Queries are const and safe from any number of threads.
+/// Owns a TrkVolume. Queries are const and safe from any number of threads; bake is not.
 class Volume {
   public:
     /// As trkOpenVolume; an empty `vdbPath` opens the sidecar alone. Throws Error.
@@ -96,6 +98,21 @@ class Volume {
         check(trkOpenVolume(vdbPath.empty() ? nullptr : vdbPath.c_str(), sidecarPath, &options,
                             &volume.handle_));
         return volume;
+    }
+
+    /// As trkMakeVolume. Throws Error.
+    static Volume make(const TrkDensity& density,
+                       const TrkVolumeOptions& options = trkDefaultVolumeOptions()) {
+        Volume volume;
+        check(trkMakeVolume(&density, &options, &volume.handle_));
+        return volume;
+    }
+
+    /// As trkBakeVolume; an empty `sidecarPath` writes nothing. Throws Error.
+    void bake(const TrkBakeOptions& options = trkDefaultBakeOptions(),
+              const std::string& sidecarPath = "") {
+        check(
+            trkBakeVolume(handle_, &options, sidecarPath.empty() ? nullptr : sidecarPath.c_str()));
     }
 
     Volume(Volume&& other) noexcept : handle_(std::exchange(other.handle_, nullptr)) {}

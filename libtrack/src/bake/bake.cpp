@@ -1,7 +1,9 @@
 // SPDX-License-Identifier: Apache-2.0
 #include "bake.h"
 
+#include "../failure.h"
 #include "../parallel.h"
+#include "../progress.h"
 #include "control_fit.h"
 #include "levels.h"
 #include "moments.h"
@@ -23,6 +25,7 @@ class Baker {
   public:
     Baker(const ExtinctionField& field, const BakeOptions& options)
         : field_(field),
+          options_(options),
           kind_(options.kind),
           channels_(field.channels()),
           size_(options.superVoxelSize),
@@ -34,10 +37,16 @@ class Baker {
 
     BakedVolume bake() {
         planSuperVoxels();
+        checkMemory();
         moments_.resize(jobs_.size() * channels_);
         corners_.resize(moments_.size());
         withEdge(static_cast<size_t>(cube_), [&](auto edge) {
-            forEach(jobs_.size(), [&](size_t i) { measure<decltype(edge)::value>(i); });
+            forEach(jobs_.size(), [&](size_t i) {
+                if (i % 1024 == 0) {
+                    Progress::poll(static_cast<double>(i) / static_cast<double>(jobs_.size()));
+                }
+                measure<decltype(edge)::value>(i);
+            });
         });
         baked_.superVoxelShift = shift_;
         baked_.channels = channels_;
@@ -71,6 +80,9 @@ class Baker {
         const Entry single = kind_ == ControlKind::kConstant ? 0 : SparseTable::kSingleFlag;
         const auto addJob = [&](const Int3& origin) {
             jobs_.push_back(origin);
+            if (jobs_.size() % 4096 == 0) {
+                Progress::poll();
+            }
             return static_cast<Entry>(jobs_.size());
         };
         std::unordered_map<Entry, Entry> constants;
@@ -102,6 +114,22 @@ class Baker {
         Entry entry;    ///< of the field, there
         size_t vertex;  ///< its first one in that brick
     };
+
+    /// Of the jobs' moments, and of all that may be made of them.
+    void checkMemory() const {
+        const size_t shape = (3 + shapeSize(kind_)) * sizeof(float);
+        const size_t perChannel =
+            sizeof(Moments) + sizeof(CornerMoments) + sizeof(BakedSuperVoxel) + shape;
+        const uint64_t wanted = field_.bytes() + 2 * plan_.bytes() +
+                                jobs_.size() * (sizeof(Int3) + channels_ * perChannel);
+        if (options_.maxMemory > 0 && wanted > options_.maxMemory) {
+            throw Error(TRK_ERROR_OUT_OF_MEMORY,
+                        "baking " + std::to_string(jobs_.size()) + " super-voxels of " +
+                            std::to_string(size_) + "^3 voxels needs " + std::to_string(wanted) +
+                            " bytes with their density, more than maxMemory = " +
+                            std::to_string(options_.maxMemory));
+        }
+    }
 
     /// Calls body(cube) for every cube of a super-voxel: what of it lies in one brick.
     template <class Body>
@@ -228,6 +256,9 @@ class Baker {
 
     /// Of a job that becomes an item.
     void addGradients(size_t job) {
+        if (!options_.gradients && kind_ != ControlKind::kAffine) {
+            return;
+        }
         for (size_t c = 0; c < channels_; ++c) {
             const Moments& m = moments(job, c);
             const auto gradient = m.min == m.max
@@ -384,6 +415,7 @@ class Baker {
     }
 
     const ExtinctionField& field_;
+    BakeOptions options_;
     ControlKind kind_;
     size_t channels_;
     int size_;
@@ -408,10 +440,13 @@ BakedVolume bake(const ExtinctionField& field, const BakeOptions& options) {
     return baked;
 }
 
-uint64_t sidecarLimit(uint64_t sourceBytes) {
+uint64_t sidecarLimit(uint64_t sourceBytes, ControlKind kind) {
     constexpr uint64_t kSmall = 4000000;
     constexpr uint64_t kLeast = 100000;
-    return std::max(kLeast, sourceBytes / (sourceBytes < kSmall ? 5 : 10));
+    // Controls that vary have more grids: no reason to have no picture.
+    constexpr uint64_t kMoreGrids = 40000;
+    return std::max(kLeast, sourceBytes / (sourceBytes < kSmall ? 5 : 10)) +
+           (kind == ControlKind::kConstant ? 0 : kMoreGrids);
 }
 
 SidecarHeader sidecarHeader(const DensitySummary& source, const ExtinctionField& field,
@@ -434,6 +469,18 @@ SidecarHeader sidecarHeader(const DensitySummary& source, const ExtinctionField&
     header.repair = source.repair;
     header.dropped = source.dropped;
     header.clamped = source.clamped;
+    return header;
+}
+
+SidecarHeader writeBake(const OutputFile& file, const DensitySummary& source,
+                        const ExtinctionField& field, BakedVolume& baked, uint64_t sidecarBytes) {
+    const SidecarHeader header = sidecarHeader(source, field, baked);
+    writeSidecar(file, header, baked, source.anchor);
+    // How well values compress was an estimate.
+    while (baked.previewSize > 0 && std::filesystem::file_size(file.path()) > sidecarBytes) {
+        coarsenPreview(baked, field);
+        writeSidecar(file, header, baked, source.anchor);
+    }
     return header;
 }
 

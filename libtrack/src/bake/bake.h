@@ -17,18 +17,27 @@ struct BakeOptions {
     /// What the sidecar may take as a file, which decides how fine the means for pictures are; 0:
     /// none are made.
     uint64_t sidecarBytes = 0;
+    /// Whether coarser super-voxels are to follow from the bake, by its gradients: a sidecar's
+    /// business.
+    bool gradients = true;
+    uint64_t maxMemory = 0;  ///< what field and bake may take together, in bytes; 0: no limit
 };
 
 /// Bakes a field, in parallel. The result has the same bits for any number of threads, and with or
-/// without tiles in the source.
+/// without tiles in the source. Throws Error: OUT_OF_MEMORY beyond maxMemory.
 BakedVolume bake(const ExtinctionField& field, const BakeOptions& options);
 
 /// How large a sidecar of a density of `sourceBytes` as a file may be, pictures included.
-uint64_t sidecarLimit(uint64_t sourceBytes);
+uint64_t sidecarLimit(uint64_t sourceBytes, ControlKind kind);
 
 /// What a sidecar of such a bake says of itself.
 SidecarHeader sidecarHeader(const DensitySummary& source, const ExtinctionField& field,
                             const BakedVolume& baked);
+
+/// Writes a bake as a sidecar of at most `sidecarBytes`, for which its pictures become coarser
+/// where they must. Does not commit.
+SidecarHeader writeBake(const OutputFile& file, const DensitySummary& source,
+                        const ExtinctionField& field, BakedVolume& baked, uint64_t sidecarBytes);
 
 /// How well a bake's control fits, over all occupied super-voxels and channels.
 struct ControlFit {

@@ -4,6 +4,7 @@
 #include "../failure.h"
 #include "density_types.h"
 #include "field_builder.h"
+#include "memory_source.h"
 #include "vdb_file.h"
 #include "vdb_tree.h"
 
@@ -91,22 +92,21 @@ void checkValues(const RegionScan& scan, uint32_t repair, const std::string& whe
     }
 }
 
+/// The field of a source, and what was found on the way.
 template <class Value>
-Density load(VdbFile& file, const VdbEntry& entry, const DensityOptions& options,
-             const std::string& where) {
-    VdbTree<Value> tree(file, entry, options.maxMemory);
-    checkBackground(tree.background(), where);
-    FieldBuilder<Value> builder(tree, options.maxMemory, where);
+Density fromSource(RegionSource<Value>& source, uint32_t repair, uint64_t maxMemory,
+                   const std::string& where) {
+    checkBackground(source.background(), where);
+    FieldBuilder<Value> builder(source, maxMemory, where);
     const RegionScan& scan = builder.scan();
-    checkValues(scan, options.repair, where);
+    checkValues(scan, repair, where);
     Density density;
     DensitySummary& summary = density.summary;
     summary.digest = scan.digest;
     summary.activeVoxels = scan.activeVoxels;
-    summary.gridBytes = tree.openvdbBytes();
     summary.min = scan.min;
     summary.max = scan.max;
-    summary.repair = options.repair;
+    summary.repair = repair;
     summary.dropped = scan.nonfinite.count;
     summary.clamped = scan.negative.count;
     summary.anchor = anchorFor(scan.box);
@@ -146,13 +146,48 @@ Density loadDensity(const std::string& path, const DensityOptions& options) {
     checkKind(entry.type, header.gridClass(), where);
     const AffineMap map = affineMap(*header.transform, where);
     const std::string valueType = valueTypeName(entry.type);
-    Density density = withValueType(
-        valueType, [&](auto zero) { return load<decltype(zero)>(file, entry, options, where); });
+    Density density = withValueType(valueType, [&](auto zero) {
+        VdbTree<decltype(zero)> tree(file, entry, options.maxMemory);
+        Density loaded = fromSource(tree, options.repair, options.maxMemory, where);
+        loaded.summary.gridBytes = tree.openvdbBytes();
+        return loaded;
+    });
     density.summary.path = path;
     density.summary.fileBytes = file.bytes();
     density.summary.fileModified = file.modified();
     density.summary.grid = {entry.name, entry.index};
     density.summary.label = entry.label();
+    density.summary.valueType = valueType;
+    density.summary.indexToWorld = map;
+    return density;
+}
+
+Density makeDensity(const TrkDensity& given, uint32_t repair, uint64_t maxMemory) {
+    const std::string name = given.name ? given.name : "density";
+    const std::string label = name.empty() ? "[0]" : name;
+    const std::string where = "grid " + label + " in memory";
+    AffineMap map;
+    for (int row = 0; row < 3; ++row) {
+        std::copy_n(given.indexToWorld + 3 * row, 3, map.linear[row]);
+        map.translation[row] = given.indexToWorld[9 + row];
+    }
+    checkMap(map, where);
+    const std::string component = given.valueType == TRK_VALUE_DOUBLE ? "double" : "float";
+    const std::string valueType = given.channels == 1                   ? component
+                                  : given.valueType == TRK_VALUE_DOUBLE ? "vec3d"
+                                                                        : "vec3s";
+    Density density = withValueType(valueType, [&](auto zero) {
+        using Value = decltype(zero);
+        const auto source = makeMemorySource<Value>(given, where);
+        Density made = fromSource(*source, repair, maxMemory, where);
+        made.summary.fileBytes =
+            source->leafCount() * LeafBatch<Value>::kLeafVoxels * sizeof(Value);
+        made.summary.gridBytes = made.summary.fileBytes;
+        return made;
+    });
+    density.summary.path = where;
+    density.summary.grid = {name, 0};
+    density.summary.label = label;
     density.summary.valueType = valueType;
     density.summary.indexToWorld = map;
     return density;

@@ -20,8 +20,9 @@ struct DensityOptions {
 
 /// What is known of a source grid besides its values.
 struct DensitySummary {
-    std::string path;
-    uint64_t fileBytes = 0;    ///< the file's size, and when it was written,
+    std::string path;          ///< or what stands for it, of a density in memory
+    uint64_t fileBytes = 0;    ///< the file's size, or of what is in memory,
+                               ///< and when it was written,
     int64_t fileModified = 0;  ///< in nanoseconds since 1970
     GridIdentity grid;
     std::string label;      ///< NAME, or NAME[i] where that alone is ambiguous or empty
@@ -47,5 +48,8 @@ struct Density {
 /// density (scalars of class fog volume or unknown, vectors of class fog volume: others may be
 /// velocities), else "density". Throws Error.
 Density loadDensity(const std::string& path, const DensityOptions& options);
+
+/// The same of a density in memory, whose numbers were found to be in range. Throws Error.
+Density makeDensity(const TrkDensity& given, uint32_t repair, uint64_t maxMemory);
 
 }  // namespace trk

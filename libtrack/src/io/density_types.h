@@ -23,6 +23,7 @@ struct ValueTraits {
     using Component = Value;
     using Vector = openvdb::math::Vec3<Value>;
     static const Component* components(const Value* values) { return values; }
+    static Component* components(Value* values) { return values; }
 };
 template <class T>
 struct ValueTraits<openvdb::math::Vec3<T>> {
@@ -30,6 +31,7 @@ struct ValueTraits<openvdb::math::Vec3<T>> {
     using Component = T;
     using Vector = openvdb::math::Vec3<T>;
     static const Component* components(const Vector* values) { return values->asPointer(); }
+    static Component* components(Vector* values) { return values->asPointer(); }
 };
 
 /// A value of the field: floats that are finite and not negative.

@@ -8,6 +8,7 @@
 #include "../failure.h"
 #include "../hash.h"
 #include "../parallel.h"
+#include "../progress.h"
 #include "density_types.h"
 #include "region_scan.h"
 #include "region_source.h"
@@ -68,6 +69,7 @@ class FieldBuilder {
 
     template <class Stored>
     bool tryScan(RawArray<Stored>& values);
+    /// Beside the lists of the source.
     void checkMemory(uint64_t wanted) const;
 
     Entry constantEntry(const FieldValue& value);
@@ -111,10 +113,12 @@ inline void store(float value, uint16_t& to) {
 
 template <class Value>
 void FieldBuilder<Value>::checkMemory(uint64_t wanted) const {
-    if (maxMemory_ > 0 && wanted > maxMemory_) {
-        throw Error(TRK_ERROR_OUT_OF_MEMORY, where_ + ": needs " + std::to_string(wanted) +
-                                                 " bytes for its bricks, more than maxMemory = " +
-                                                 std::to_string(maxMemory_));
+    const uint64_t all = wanted + source_.listBytes();
+    if (maxMemory_ > 0 && all > maxMemory_) {
+        throw Error(TRK_ERROR_OUT_OF_MEMORY,
+                    where_ + ": needs " + std::to_string(all) +
+                        " bytes for its bricks and tables, more than maxMemory = " +
+                        std::to_string(maxMemory_));
     }
 }
 
@@ -123,7 +127,7 @@ template <class Value>
 template <class Stored>
 bool FieldBuilder<Value>::tryScan(RawArray<Stored>& values) {
     const size_t leafCount = source_.leafCount();
-    checkMemory(leafCount * kBrickValues * sizeof(Stored));
+    checkMemory(leafCount * (kBrickValues * sizeof(Stored) + sizeof(FieldValue)));
     values.resize(leafCount * kBrickValues);
     leafConstants_.resize(leafCount);
     scan_ = {};
@@ -364,6 +368,9 @@ class FieldBuilder<Value>::Bricks {
         }
         const Entry entry = isLeaf(corners[0]) ? corners[0] : newSlot();
         bricks_.push_back({corners, entry});
+        if (bricks_.size() % 4096 == 0) {
+            Progress::poll();
+        }
         return entry;
     }
 
@@ -397,7 +404,8 @@ ExtinctionField FieldBuilder<Value>::finish(RawArray<Stored>& values, const Int3
         const SparseTable source = sourceTable(anchor, box);
         table = bricks.fill(source, box);
     }
-    checkMemory(bricks.slots() * kBrickValues * sizeof(Stored));
+    checkMemory(bricks.slots() * kBrickValues * sizeof(Stored) +
+                leafConstants_.size() * sizeof(FieldValue) + table.bytes());
     values.resize(bricks.slots() * kBrickValues);
     const std::vector<Brick>& list = bricks.bricks();
     parallelFor(list.size(), 64, [&](size_t i) { bricks.complete(list[i]); });

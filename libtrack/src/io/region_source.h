@@ -48,6 +48,10 @@ class RegionSource {
     const std::vector<Tile<Value>>& tiles() const { return tiles_; }
     size_t leafCount() const { return leafOrigins_.size(); }
     const std::vector<Origin>& leafOrigins() const { return leafOrigins_; }
+    /// Memory that the lists of leaves and tiles take.
+    virtual size_t listBytes() const {
+        return leafOrigins_.size() * sizeof(Origin) + tiles_.size() * sizeof(Tile<Value>);
+    }
     /// Whether the values are halfs, whatever type holds them.
     bool isHalf() const { return half_; }
 

@@ -360,6 +360,18 @@ std::string VdbFile::listing() const {
     return list.empty() ? "no grids" : list;
 }
 
+void checkMap(const AffineMap& map, const std::string& where) {
+    const double shape = map.relativeDeterminant();
+    bool finite = std::isfinite(shape);
+    for (const double t : map.translation) {
+        finite = finite && std::isfinite(t);
+    }
+    if (!finite || std::fabs(shape) < 1e-12) {
+        throw Error(TRK_ERROR_UNSUPPORTED_GRID,
+                    where + ": has a singular or infinite transform; expected an invertible one");
+    }
+}
+
 AffineMap affineMap(const openvdb::math::Transform& transform, const std::string& where) {
     if (!transform.isLinear()) {
         throw Error(
@@ -380,15 +392,7 @@ AffineMap affineMap(const openvdb::math::Transform& transform, const std::string
         }
         map.translation[row] = matrix(3, row);
     }
-    const double shape = map.relativeDeterminant();
-    bool finite = std::isfinite(shape);
-    for (const double t : map.translation) {
-        finite = finite && std::isfinite(t);
-    }
-    if (!finite || std::fabs(shape) < 1e-12) {
-        throw Error(TRK_ERROR_UNSUPPORTED_GRID,
-                    where + ": has a singular or infinite transform; expected an invertible one");
-    }
+    checkMap(map, where);
     return map;
 }
 

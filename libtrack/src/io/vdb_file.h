@@ -122,6 +122,9 @@ class VdbFile {
 /// begins the message.
 AffineMap affineMap(const openvdb::math::Transform& transform, const std::string& where);
 
+/// Throws UNSUPPORTED_GRID for a map that is singular or has NaN or infinities.
+void checkMap(const AffineMap& map, const std::string& where);
+
 /// An OpenVDB transform that does what `map` does.
 openvdb::math::Transform::Ptr makeTransform(const AffineMap& map);
 

@@ -3,6 +3,7 @@
 
 #include "../failure.h"
 #include "../hash.h"
+#include "../progress.h"
 #include "density_types.h"
 
 #include <tbb/parallel_pipeline.h>
@@ -163,6 +164,7 @@ void VdbTree<Value>::readUpper(const Origin& origin) {
     forEachBit(upper_.children, [&](size_t i) {
         const Origin lower = childOrigin(origin, i, kUpperLog2, kLowerShift);
         ++lowerNodes_;
+        Progress::poll();
         readInternal(lower, kLowerLog2, kLeafShift, lower_);
         forEachBit(lower_.children, [&](size_t j) {
             uint64_t mask[kLeafMaskBytes / 8];
@@ -176,9 +178,7 @@ void VdbTree<Value>::readUpper(const Origin& origin) {
 
 template <class Value>
 void VdbTree<Value>::checkMemory() const {
-    const uint64_t held = this->leafOrigins_.size() * (sizeof(Origin) + sizeof(uint64_t)) +
-                          this->tiles_.size() * sizeof(Tile<Value>);
-    if (maxMemory_ > 0 && held > maxMemory_) {
+    if (maxMemory_ > 0 && this->listBytes() > maxMemory_) {
         throw Error(TRK_ERROR_OUT_OF_MEMORY,
                     place_ + ": has more than " + std::to_string(this->leafOrigins_.size()) +
                         " leaves and " + std::to_string(this->tiles_.size()) +
@@ -280,8 +280,11 @@ void VdbTree<Value>::forEachBatch(const std::function<void(const LeafBatch<Value
                                     &scratch->values[i * LeafBatch<Value>::kLeafVoxels], place_);
         }
         body({batch->first, batch->packed.size(), batch->masks.data(), scratch->values.data()});
-        const tbb::spin_mutex::scoped_lock lock(idleLock);
-        idle.push_back(std::move(scratch));
+        {
+            const tbb::spin_mutex::scoped_lock lock(idleLock);
+            idle.push_back(std::move(scratch));
+        }
+        Progress::poll(static_cast<double>(batch->first) / static_cast<double>(this->leafCount()));
     };
     tbb::task_group_context context(tbb::task_group_context::isolated);
     const auto tokens = 2 * static_cast<size_t>(tbb::this_task_arena::max_concurrency());

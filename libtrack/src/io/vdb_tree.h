@@ -25,6 +25,10 @@ class VdbTree : public RegionSource<Value> {
 
     void forEachBatch(const std::function<void(const LeafBatch<Value>&)>& body) override;
 
+    size_t listBytes() const override {
+        return RegionSource<Value>::listBytes() + maskHashes_.size() * sizeof(uint64_t);
+    }
+
     /// What OpenVDB holds in memory for such a tree.
     uint64_t openvdbBytes() const;
 

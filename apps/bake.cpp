@@ -70,14 +70,10 @@ void run(const Command& command, const std::vector<std::string>& given) {
     const auto seconds = [&] {
         return std::chrono::duration<double>(std::chrono::steady_clock::now() - start).count();
     };
-    trk::DensityOptions densityOptions;
-    densityOptions.gridNamed = arguments.has("grid");
-    densityOptions.gridName = arguments.text("grid");
-    densityOptions.repair = repairBits(arguments);
     trk::Density density;
     {
         const Progress progress(arguments, "reading " + input);
-        density = trk::loadDensity(input, densityOptions);
+        density = trk::loadDensity(input, densityOptionsOf(arguments));
     }
     const double readTime = seconds();
     trk::OutputFile file(output, arguments.flag("force"));
@@ -87,6 +83,8 @@ void run(const Command& command, const std::vector<std::string>& given) {
     {
         const Progress progress(arguments, "baking " + input);
         bakeOptions.sidecarBytes = trk::sidecarLimit(summary.fileBytes, bakeOptions.kind);
+        bakeOptions.maxMemory = memoryLimit(arguments);
+        bakeOptions.where = input;
         baked = trk::bake(density.field, bakeOptions);
     }
     const double bakeTime = seconds() - readTime;

@@ -1,6 +1,8 @@
 // SPDX-License-Identifier: Apache-2.0
 #include "command_line.h"
 
+#include "io/density.h"
+
 #include "failure.h"
 
 #include <tbb/global_control.h>
@@ -8,6 +10,7 @@
 
 #include <algorithm>
 #include <cctype>
+#include <charconv>
 #include <cmath>
 #include <cstdio>
 #include <filesystem>
@@ -98,7 +101,36 @@ void addGridOptions(po::options_description& options) {
                           "grid to read, NAME or NAME[i]; default: the only one that can be a "
                           "density, else density")("drop-nonfinite", po::bool_switch(),
                                                    "read NaN and infinite densities as 0")(
-        "clamp-negative", po::bool_switch(), "read negative densities as 0");
+        "clamp-negative", po::bool_switch(), "read negative densities as 0")(
+        "max-memory", po::value<std::string>(),
+        "fail rather than hold more for the volume: bytes, or 512M, 4G (powers of 1024)");
+}
+
+uint64_t memoryLimit(const Arguments& arguments) {
+    if (!arguments.has("max-memory")) {
+        return 0;
+    }
+    const std::string text = arguments.text("max-memory");
+    const char* last = text.data() + text.size();
+    uint64_t bytes = 0;
+    const auto [end, error] = std::from_chars(text.data(), last, bytes);
+    const std::string units = "KMGT";
+    const size_t unit = end == last ? std::string::npos : units.find(*end);
+    const int shift = unit == std::string::npos ? 0 : 10 * (static_cast<int>(unit) + 1);
+    if (error != std::errc() || end + (shift > 0 ? 1 : 0) != last || bytes == 0 ||
+        bytes > UINT64_MAX >> shift) {
+        throw UsageError("--max-memory " + text + ": expected bytes above 0, as 512M or 4G, say");
+    }
+    return bytes << shift;
+}
+
+trk::DensityOptions densityOptionsOf(const Arguments& arguments) {
+    trk::DensityOptions options;
+    options.gridNamed = arguments.has("grid");
+    options.gridName = arguments.text("grid");
+    options.repair = repairBits(arguments);
+    options.maxMemory = memoryLimit(arguments);
+    return options;
 }
 
 uint32_t repairBits(const Arguments& arguments) {

@@ -13,6 +13,10 @@
 #include <string>
 #include <vector>
 
+namespace trk {
+struct DensityOptions;
+}
+
 namespace apps {
 
 /// A mistake in the command line: exit code 2.
@@ -72,9 +76,13 @@ class Arguments {
 void refuseInput(const std::string& output, const std::vector<std::string>& inputs);
 
 /// Options of opening a volume that several commands share: --grid, --drop-nonfinite,
-/// --clamp-negative.
+/// --clamp-negative, --max-memory.
 void addGridOptions(boost::program_options::options_description& options);
 uint32_t repairBits(const Arguments& arguments);
+/// Bytes of --max-memory; 0: no limit. Throws UsageError.
+uint64_t memoryLimit(const Arguments& arguments);
+/// What those options say of the density to load.
+trk::DensityOptions densityOptionsOf(const Arguments& arguments);
 
 /// --color r,g,b: what each channel's extinction is multiplied by.
 void addColorOption(boost::program_options::options_description& options);

@@ -42,9 +42,9 @@ std::string inOptions(std::string message) {
     const std::pair<const char*, const char*> words[] = {
         {"TRK_REPAIR_DROP_NONFINITE", "--drop-nonfinite"},
         {"TRK_REPAIR_CLAMP_NEGATIVE", "--clamp-negative"},
+        {"maxMemory", "--max-memory"},
         {"TRK_METHOD_EXACT", "--method exact"},
         {"TRK_METHOD_CONTROL", "--method control"},
-        {"bake one", "make it with `vdbtrack bake`"},
         {", and replacing it was not asked for", "; --force replaces it"}};
     for (const auto& [library, program] : words) {
         const size_t at = message.find(library);

@@ -231,13 +231,9 @@ void run(const Command& command, const std::vector<std::string>& given) {
     requireGnuplot();
 
     const auto start = std::chrono::steady_clock::now();
-    trk::DensityOptions densityOptions;
-    densityOptions.gridNamed = arguments.has("grid");
-    densityOptions.gridName = arguments.text("grid");
-    densityOptions.repair = repairBits(arguments);
     {
         const Progress progress(arguments, "reading " + input);
-        trk::Density density = trk::loadDensity(input, densityOptions);
+        trk::Density density = trk::loadDensity(input, densityOptionsOf(arguments));
         report.source.summary = density.summary;
         report.source.field =
             std::make_shared<const trk::ExtinctionField>(std::move(density.field));

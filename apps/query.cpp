@@ -302,6 +302,7 @@ TrkVolumeOptions volumeOptionsOf(const Arguments& arguments) {
     options.choice = choiceIndex("choice", arguments.text("choice"), vdbtools::kChoiceNames);
     options.global = arguments.flag("global") ? 1 : 0;
     options.repair = repairBits(arguments);
+    options.maxMemory = memoryLimit(arguments);
     options.gridName = arguments.has("grid") ? arguments.get<std::string>("grid").c_str() : nullptr;
     return options;
 }
@@ -381,6 +382,7 @@ trk::Volume openInside(const Inputs& inputs) {
     options.choice = inputs.options.choice;
     options.global = inputs.options.global != 0;
     options.repair = inputs.options.repair;
+    options.maxMemory = inputs.options.maxMemory;
     options.bakeMissing = true;
     trk::Volume volume = trk::openVolume(inputs.density.c_str(), inputs.sidecar(), options);
     return volume;

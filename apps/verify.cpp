@@ -23,16 +23,13 @@ void run(const Command& command, const std::vector<std::string>& given) {
     const std::string path =
         arguments.has("SIDECAR") ? arguments.text("SIDECAR") : trk::defaultSidecarPath(input);
     const Progress progress(arguments, "verifying " + path);
-    trk::DensityOptions densityOptions;
-    densityOptions.gridNamed = arguments.has("grid");
-    densityOptions.gridName = arguments.text("grid");
-    densityOptions.repair = repairBits(arguments);
+    trk::DensityOptions densityOptions = densityOptionsOf(arguments);
     if (std::filesystem::exists(input)) {  // else that is what to say first
         densityOptions.repair |= trk::readSidecarHeader(path).repair;
     }
     const trk::DensitySummary summary = trk::loadDensity(input, densityOptions).summary;
-    const trk::Sidecar sidecar =
-        trk::readSidecar(path, &summary, TRK_CHECK_FULL, trk::SidecarParts::kAll);
+    const trk::Sidecar sidecar = trk::readSidecar(
+        path, &summary, TRK_CHECK_FULL, trk::SidecarParts::kAll, densityOptions.maxMemory);
     const vdbtools::VerifyReport report = vdbtools::verify(summary, sidecar);
     if (!report.holds) {
         throw trk::Error(TRK_ERROR_SIDECAR_MISMATCH, path + ": " + report.counterexample);

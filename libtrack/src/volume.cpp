@@ -165,6 +165,7 @@ void bakeInMemory(Volume& volume, const VolumeOptions& options) {
     BakeOptions bakeOptions;
     bakeOptions.maxMemory = options.maxMemory;
     bakeOptions.gradients = false;
+    bakeOptions.where = volume.density->path;
     addSuperVoxels(volume, bake(*volume.field, bakeOptions), options, volume.density->path);
 }
 
@@ -261,6 +262,7 @@ void bakeVolume(Volume& volume, BakeOptions options, const char* path, bool over
         options.sidecarBytes = sidecarLimit(volume.density->fileBytes, options.kind);
     }
     options.gradients = path != nullptr;
+    options.where = volume.density->path;
     Volume next = makeVolume(*volume.density, volume.field, volume.options);
     BakedVolume baked;
     {

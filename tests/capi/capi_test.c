@@ -23,6 +23,10 @@ int main(int argc, char** argv) {
     TrkRay ray = {{0.0f, 0.0f, 0.0f}, 0.0f, {1.0f, 0.0f, 0.0f}, INFINITY};
     TrkStatistics statistics = trkDefaultStatistics();
     TrkFreePaths paths = trkDefaultFreePaths();
+    TrkBakeOptions bake = trkDefaultBakeOptions();
+    TrkDensity density = trkDefaultDensity();
+    const float values[8] = {1.0f, 2.0f, 3.0f, 4.0f, 5.0f, 6.0f, 7.0f, 8.0f};
+    const float corner[3] = {1.0f, 1.0f, 1.0f};
     float transmittance = -1.0f;
     float standardError = -1.0f;
     float extinction = -1.0f;
@@ -40,6 +44,7 @@ int main(int argc, char** argv) {
     expect(strcmp(trkGetStatusName(TRK_ERROR_NO_SIDECAR), "TRK_ERROR_NO_SIDECAR") == 0,
            "trkGetStatusName(TRK_ERROR_NO_SIDECAR)");
 
+    bake.superVoxelSize = 8;
     options.choice = TRK_CHOICE_MEAN;
     expect(trkOpenVolume(argv[1], NULL, &options, &volume) == TRK_OK, "trkOpenVolume");
     if (!volume) {
@@ -73,8 +78,20 @@ int main(int argc, char** argv) {
     expect(
         trkSampleExtinction(volume, ray.origin, 0, 1, &extinction, 0) == TRK_OK && extinction > 0,
         "trkSampleExtinction");
+    expect(trkBakeVolume(volume, &bake, NULL) == TRK_OK, "trkBakeVolume");
+    expect(trkGetVolumeInfo(volume, &info) == TRK_OK && info.superVoxelSize == 8, "the new bake");
     trkCloseVolume(volume);
     trkCloseVolume(NULL);
+
+    density.values = values;
+    for (a = 0; a < 3; ++a) {
+        density.extent[a] = 2;
+    }
+    expect(trkMakeVolume(&density, NULL, &volume) == TRK_OK, "trkMakeVolume");
+    expect(trkSampleExtinction(volume, corner, 0, 1, &extinction, 0) == TRK_OK &&
+               extinction == values[7],
+           "the voxel at (1, 1, 1)");
+    trkCloseVolume(volume);
 
     expect(trkOpenVolume("/no/such/file.vdb", NULL, NULL, &volume) == TRK_ERROR_IO, "missing file");
     expect(volume == NULL, "no volume after a failure");

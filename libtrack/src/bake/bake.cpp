@@ -124,8 +124,9 @@ class Baker {
                                 jobs_.size() * (sizeof(Int3) + channels_ * perChannel);
         if (options_.maxMemory > 0 && wanted > options_.maxMemory) {
             throw Error(TRK_ERROR_OUT_OF_MEMORY,
-                        "baking " + std::to_string(jobs_.size()) + " super-voxels of " +
-                            std::to_string(size_) + "^3 voxels needs " + std::to_string(wanted) +
+                        options_.where + ": baking " + std::to_string(jobs_.size()) +
+                            " super-voxels of " + std::to_string(size_) + "^3 voxels needs " +
+                            std::to_string(wanted) +
                             " bytes with their density, more than maxMemory = " +
                             std::to_string(options_.maxMemory));
         }

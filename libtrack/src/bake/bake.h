@@ -7,6 +7,7 @@
 #include "../super_voxels.h"
 
 #include <cstdint>
+#include <string>
 
 namespace trk {
 
@@ -20,6 +21,7 @@ struct BakeOptions {
     /// Whether coarser super-voxels are to follow from the bake, by its gradients: a sidecar's
     /// business.
     bool gradients = true;
+    std::string where;       ///< begins messages
     uint64_t maxMemory = 0;  ///< what field and bake may take together, in bytes; 0: no limit
 };
 

@@ -73,7 +73,9 @@ void run(const Command& command, const std::vector<std::string>& given) {
     trk::Density density;
     {
         const Progress progress(arguments, "reading " + input);
-        density = trk::loadDensity(input, densityOptionsOf(arguments));
+        trk::DensityOptions densityOptions = densityOptionsOf(arguments);
+        densityOptions.bricks = trk::Bricks::kAllThatFit;
+        density = trk::loadDensity(input, densityOptions);
     }
     const double readTime = seconds();
     trk::OutputFile file(output, arguments.flag("force"));
@@ -85,12 +87,12 @@ void run(const Command& command, const std::vector<std::string>& given) {
         bakeOptions.sidecarBytes = trk::sidecarLimit(summary.fileBytes, bakeOptions.kind);
         bakeOptions.maxMemory = memoryLimit(arguments);
         bakeOptions.where = input;
-        baked = trk::bake(density.field, bakeOptions);
+        baked = trk::bake(density.pages(), bakeOptions);
     }
     const double bakeTime = seconds() - readTime;
     {
         const Progress progress(arguments, "writing " + output);
-        header = trk::writeBake(file, summary, density.field, baked, bakeOptions.sidecarBytes);
+        header = trk::writeBake(file, summary, density.pages(), baked, bakeOptions.sidecarBytes);
         file.commit();
     }
     if (baked.items.empty() && !arguments.quiet()) {

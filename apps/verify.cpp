@@ -24,13 +24,15 @@ void run(const Command& command, const std::vector<std::string>& given) {
         arguments.has("SIDECAR") ? arguments.text("SIDECAR") : trk::defaultSidecarPath(input);
     const Progress progress(arguments, "verifying " + path);
     trk::DensityOptions densityOptions = densityOptionsOf(arguments);
+    densityOptions.bricks = trk::Bricks::kNone;
     if (std::filesystem::exists(input)) {  // else that is what to say first
         densityOptions.repair |= trk::readSidecarHeader(path).repair;
     }
     const trk::DensitySummary summary = trk::loadDensity(input, densityOptions).summary;
     const trk::Sidecar sidecar = trk::readSidecar(
         path, &summary, TRK_CHECK_FULL, trk::SidecarParts::kAll, densityOptions.maxMemory);
-    const vdbtools::VerifyReport report = vdbtools::verify(summary, sidecar);
+    const vdbtools::VerifyReport report =
+        vdbtools::verify(summary, sidecar, densityOptions.maxMemory);
     if (!report.holds) {
         throw trk::Error(TRK_ERROR_SIDECAR_MISMATCH, path + ": " + report.counterexample);
     }

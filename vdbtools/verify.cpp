@@ -11,6 +11,7 @@
 #include <atomic>
 #include <cmath>
 #include <map>
+#include <numeric>
 #include <optional>
 #include <set>
 #include <sstream>
@@ -29,20 +30,37 @@ std::ostream& operator<<(std::ostream& out, const Int3& p) {
     return out << "(" << p[0] << ", " << p[1] << ", " << p[2] << ")";
 }
 
-/// The voxels of a source, repaired, as they are looked up to be compared. In index space, but for
-/// its table, which is in local space. Immutable once made.
+/// The voxels of a source, repaired, as they are looked up to be compared: all of its leaves at
+/// once, or those of a page. In index space, but for its table, which is in local space.
 template <class Value>
 class Voxels {
   public:
     using Sample = trk::Sample<Value>;
     static constexpr int kLeafShift = 3;
 
-    Voxels(trk::RegionSource<Value>& source, const Int3& anchor) : anchor_(anchor) {
-        leaves_.resize(source.leafCount() * kLeafVoxels);
+    /// `maxMemory`: what all may take, in bytes; 0: no limit.
+    Voxels(trk::VdbTree<Value>& source, const Int3& anchor, uint64_t maxMemory)
+        : source_(source), anchor_(anchor), pageLeaves_(source.leafCount()) {
+        // The lists of leaves, their boxes and the table take the other half.
+        if (maxMemory > 0) {
+            constexpr uint64_t kLeast = 64;
+            pageLeaves_ = std::min<size_t>(
+                pageLeaves_, std::max(maxMemory / 2 / (kLeafVoxels * sizeof(Sample)), kLeast));
+        }
+        const bool all = pageLeaves_ == source.leafCount();
+        leaves_.resize(all ? source.leafCount() * kLeafVoxels : 0);
+        slotOf_.resize(source.leafCount());
+        std::iota(slotOf_.begin(), slotOf_.end(), 0u);
+        std::vector<char> occupied(source.leafCount());
         source.forEachBatch([&](const trk::LeafBatch<Value>& batch) {
-            std::transform(batch.leaf(0), batch.leaf(batch.count),
-                           leaves_.begin() + static_cast<std::ptrdiff_t>(batch.first * kLeafVoxels),
-                           [](const Value& v) { return trk::fieldValue(v); });
+            for (size_t i = 0; i < batch.count; ++i) {
+                occupied[batch.index(i)] =
+                    std::any_of(batch.leaf(i), batch.leaf(i + 1),
+                                [](const Value& v) { return trk::fieldValue(v) != Sample{}; });
+            }
+            if (all) {
+                take(batch);
+            }
         });
         IntBox box;
         const auto add = [&](const std::array<int32_t, 3>& origin, int shift) {
@@ -54,9 +72,7 @@ class Voxels {
         // What is 0 everywhere may lie where there is no local space.
         std::vector<SparseTable::Place> places;
         for (size_t i = 0; i < source.leafCount(); ++i) {
-            const auto first = leaves_.begin() + static_cast<std::ptrdiff_t>(i * kLeafVoxels);
-            if (std::any_of(first, first + kLeafVoxels,
-                            [](const Sample& v) { return v != Sample{}; })) {
+            if (occupied[i]) {
                 add(source.leafOrigins()[i], kLeafShift);
                 places.push_back(
                     {blocks_.back().lo, kLeafShift, static_cast<SparseTable::Entry>(i + 1)});
@@ -77,6 +93,59 @@ class Voxels {
         table_.assemble(std::move(places));
     }
 
+    /// Calls body(begin, end) for parts of [0, count), in order, until it answers false, while the
+    /// leaves are at hand that `leavesOf(i, f)` calls f(leaf) for.
+    template <class LeavesOf, class Body>
+    void forEachPage(size_t count, const LeavesOf& leavesOf, const Body& body) {
+        if (pageLeaves_ == slotOf_.size()) {
+            body(size_t{0}, count);
+            return;
+        }
+        std::vector<uint32_t> wanted;
+        for (size_t begin = 0; begin < count;) {
+            std::fill(slotOf_.begin(), slotOf_.end(), kNowhere);
+            wanted.clear();
+            size_t end = begin;
+            while (end < count && wanted.size() < pageLeaves_) {
+                leavesOf(end++, [&](size_t leaf) {
+                    if (slotOf_[leaf] == kNowhere) {
+                        slotOf_[leaf] = static_cast<uint32_t>(wanted.size());
+                        wanted.push_back(static_cast<uint32_t>(leaf));
+                    }
+                });
+            }
+            leaves_.resize(std::max(leaves_.size(), wanted.size() * kLeafVoxels));
+            std::sort(wanted.begin(), wanted.end());
+            source_.forEachBatchOf(wanted,
+                                   [&](const trk::LeafBatch<Value>& batch) { take(batch); });
+            if (!body(begin, end)) {
+                return;
+            }
+            begin = end;
+        }
+    }
+
+    /// Calls f(leaf) for the leaves that have voxels in a closed box of `edge` cells.
+    template <class F>
+    void forEachLeaf(const Int3& origin, int64_t edge, const F& f) const {
+        Int3 lo;
+        for (size_t a = 0; a < 3; ++a) {
+            lo[a] = origin[a] - anchor_[a];
+        }
+        Int3 p;
+        for (p[0] = lo[0] & ~int64_t{7}; p[0] <= lo[0] + edge; p[0] += 8) {
+            for (p[1] = lo[1] & ~int64_t{7}; p[1] <= lo[1] + edge; p[1] += 8) {
+                for (p[2] = lo[2] & ~int64_t{7}; p[2] <= lo[2] + edge; p[2] += 8) {
+                    const auto entry = table_.find(p[0], p[1], p[2]).entry;
+                    if (!isConstant(entry)) {
+                        f(entry - 1);
+                    }
+                }
+            }
+        }
+    }
+
+    /// The value of a voxel, whose leaf is at hand.
     Sample at(const Int3& p) const {
         const Int3 local{{p[0] - anchor_[0], p[1] - anchor_[1], p[2] - anchor_[2]}};
         return value(table_.find(local[0], local[1], local[2]).entry, local);
@@ -124,6 +193,16 @@ class Voxels {
   private:
     static constexpr size_t kLeafVoxels = trk::LeafBatch<Value>::kLeafVoxels;
     static constexpr SparseTable::Entry kConstantFlag = 0x40000000u;
+    static constexpr uint32_t kNowhere = 0xffffffffu;
+
+    void take(const trk::LeafBatch<Value>& batch) {
+        for (size_t i = 0; i < batch.count; ++i) {
+            const size_t at = slotOf_[batch.index(i)] * kLeafVoxels;
+            std::transform(batch.leaf(i), batch.leaf(i + 1),
+                           leaves_.begin() + static_cast<std::ptrdiff_t>(at),
+                           [](const Value& v) { return trk::fieldValue(v); });
+        }
+    }
 
     static bool isConstant(SparseTable::Entry entry) {
         return entry == SparseTable::kEmpty || (entry & kConstantFlag) != 0;
@@ -142,17 +221,20 @@ class Voxels {
         }
         return isConstant(entry)
                    ? constants_[entry & ~kConstantFlag]
-                   : leaves_[(entry - 1) * kLeafVoxels + static_cast<size_t>((local[0] & 7) << 6 |
-                                                                             (local[1] & 7) << 3 |
-                                                                             (local[2] & 7))];
+                   : leaves_[slotOf_[entry - 1] * kLeafVoxels +
+                             static_cast<size_t>((local[0] & 7) << 6 | (local[1] & 7) << 3 |
+                                                 (local[2] & 7))];
     }
 
+    trk::VdbTree<Value>& source_;
     Int3 anchor_;
+    size_t pageLeaves_;  // as many leaves, or as one place has, are at hand
     SparseTable table_;
     std::vector<IntBox> blocks_;  // local
     std::vector<Sample> constants_;
     std::map<Sample, SparseTable::Entry> known_;
     std::vector<Sample> leaves_;
+    std::vector<uint32_t> slotOf_;  // where a leaf's values are among them
 };
 
 /// Everything in index space here; `table` alone is in local space.
@@ -162,7 +244,7 @@ class Verifier {
     using Regions = Voxels<Value>;
     using Sample = trk::Sample<Value>;
 
-    Verifier(const Regions& regions, const trk::Sidecar& sidecar)
+    Verifier(Regions& regions, const trk::Sidecar& sidecar)
         : regions_(regions), sidecar_(sidecar), size_(sidecar.baked.superVoxelSize()) {}
 
     VerifyReport run() {
@@ -174,7 +256,8 @@ class Verifier {
         report.superVoxels = sidecar_.baked.table.occupiedItems();
         std::atomic<uint64_t> vertices{0};
         known_.clear();
-        const size_t badPlace = firstFailure(places.size(), [&](size_t i) {
+        const auto leavesOf = [&](size_t i, const auto& f) { forEachLeaf(places[i], f); };
+        const size_t badPlace = firstFailure(places.size(), leavesOf, [&](size_t i) {
             uint64_t count = 0;
             const std::string wrong = checkPlace(places[i], count);
             vertices += count;
@@ -187,8 +270,11 @@ class Verifier {
             return report;
         }
         const std::vector<IntBox> blocks = regions_.blocks();
+        const auto leafOf = [&](size_t i, const auto& f) {
+            regions_.forEachLeaf(blocks[i].lo, 0, f);
+        };
         const size_t badBlock = firstFailure(
-            blocks.size(), [&](size_t i) { return !checkCoverage(blocks[i]).empty(); });
+            blocks.size(), leafOf, [&](size_t i) { return !checkCoverage(blocks[i]).empty(); });
         if (badBlock < blocks.size()) {
             report.counterexample = checkCoverage(blocks[badBlock]);
             return report;
@@ -230,20 +316,39 @@ class Verifier {
                  local[2] + sidecar_.anchor[2]}};
     }
 
-    /// Lowest i in [0, count) for which `fails(i)`, or count.
-    template <class Fails>
-    size_t firstFailure(size_t count, const Fails& fails) const {
+    /// Lowest i in [0, count) for which `fails(i)`, or count. What failed last is at hand still.
+    template <class LeavesOf, class Fails>
+    size_t firstFailure(size_t count, const LeavesOf& leavesOf, const Fails& fails) {
         std::atomic<size_t> first{count};
-        trk::parallelRanges(count, 16, [&](size_t begin, size_t end) {
-            for (size_t i = begin; i != end; ++i) {
-                if (i < first && fails(i)) {
-                    size_t known = first;
-                    while (i < known && !first.compare_exchange_weak(known, i)) {
+        regions_.forEachPage(count, leavesOf, [&](size_t pageBegin, size_t pageEnd) {
+            trk::parallelRanges(pageEnd - pageBegin, 16, [&](size_t begin, size_t end) {
+                for (size_t i = pageBegin + begin; i != pageBegin + end; ++i) {
+                    if (i < first && fails(i)) {
+                        size_t known = first;
+                        while (i < known && !first.compare_exchange_weak(known, i)) {
+                        }
                     }
                 }
-            }
+            });
+            return first == count;
         });
         return first;
+    }
+
+    /// Calls f(leaf) for the leaves that a place is compared with.
+    template <class F>
+    void forEachLeaf(const Place& place, const F& f) const {
+        const int64_t edge = int64_t{1} << place.shift;
+        if (edge <= size_) {
+            regions_.forEachLeaf(place.origin, edge, f);
+            return;
+        }
+        forEachRegionAround(place, 3, [&](const Int3& at, int shift) {
+            if (shift == 3) {
+                regions_.forEachLeaf(at, 7, f);
+            }
+            return true;
+        });
     }
 
     std::string checkPlace(const Place& place, uint64_t& vertices) const {
@@ -353,52 +458,56 @@ class Verifier {
 
     /// A place larger than a super-voxel claims one value everywhere, faces included.
     std::string checkUniform(const Place& place, uint64_t& vertices) const {
-        const int64_t edge = int64_t{1} << place.shift;
         const auto controls = controlsOf(place);
         std::string wrong;
+        forEachRegionAround(place, 0, [&](const Int3& at, int) {
+            ++vertices;
+            const Sample sample = regions_.at(at);
+            for (size_t c = 0; c < kChannels && wrong.empty(); ++c) {
+                // Homogeneous: its control is its centre's everywhere.
+                wrong = checkVertex(place, c, at, sample[c], controls[c].centre);
+            }
+            return wrong.empty();
+        });
+        return wrong;
+    }
+
+    /// Calls f(origin, shift) for every uniform region, or else one of 2^least voxels, that has a
+    /// part in the closed box of a place, until it answers false.
+    template <class F>
+    void forEachRegionAround(const Place& place, int least, const F& f) const {
+        const int64_t edge = int64_t{1} << place.shift;
         const IntBox closed{
             place.origin,
             {{place.origin[0] + edge + 1, place.origin[1] + edge + 1, place.origin[2] + edge + 1}}};
         // The place itself and the seven regions that its upper faces belong to.
-        for (int corner = 0; corner < 8 && wrong.empty(); ++corner) {
+        bool goOn = true;
+        for (int corner = 0; corner < 8 && goOn; ++corner) {
             const Int3 origin{{place.origin[0] + (corner & 4 ? edge : 0),
                                place.origin[1] + (corner & 2 ? edge : 0),
                                place.origin[2] + (corner & 1 ? edge : 0)}};
-            forEachRegion(origin, place.shift, closed, [&](const Int3& at, const Sample& sample) {
-                ++vertices;
-                for (size_t c = 0; c < kChannels && wrong.empty(); ++c) {
-                    // Homogeneous: its control is its centre's everywhere.
-                    wrong = checkVertex(place, c, at, sample[c], controls[c].centre);
-                }
-                return wrong.empty();
-            });
+            goOn = forEachRegion(origin, place.shift, least, closed, f);
         }
-        return wrong;
     }
 
-    /// Calls `f(at, value)` for every uniform region, or else voxel, of the aligned region of
-    /// 2^shift voxels at `origin` that meets `box`, until it answers false.
+    /// The same for an aligned region of 2^shift voxels, as far as it meets `box`.
     template <class F>
-    bool forEachRegion(const Int3& origin, int shift, const IntBox& box, const F& f) const {
+    bool forEachRegion(const Int3& origin, int shift, int least, const IntBox& box,
+                       const F& f) const {
         const int64_t edge = int64_t{1} << shift;
         for (size_t a = 0; a < 3; ++a) {
             if (origin[a] >= box.hi[a] || origin[a] + edge <= box.lo[a]) {
                 return true;
             }
         }
-        if (shift == 0) {
-            return f(origin, regions_.at(origin));
-        }
-        if (shift >= 3) {
-            if (regions_.isUniform(origin, shift)) {
-                return f(origin, regions_.at(origin));
-            }
+        if (shift <= least || (shift >= 3 && regions_.isUniform(origin, shift))) {
+            return f(origin, shift);
         }
         for (int64_t octant = 0; octant < 8; ++octant) {
             const int64_t half = edge / 2;
             const Int3 part{{origin[0] + (octant >> 2) * half, origin[1] + (octant >> 1 & 1) * half,
                              origin[2] + (octant & 1) * half}};
-            if (!forEachRegion(part, shift - 1, box, f)) {
+            if (!forEachRegion(part, shift - 1, least, box, f)) {
                 return false;
             }
         }
@@ -509,7 +618,7 @@ class Verifier {
         return std::nullopt;
     }
 
-    const Regions& regions_;
+    Regions& regions_;
     const trk::Sidecar& sidecar_;
     int64_t size_;
     std::set<SparseTable::Key> known_;  // places that others look like, while they are listed
@@ -517,15 +626,16 @@ class Verifier {
 
 }  // namespace
 
-VerifyReport verify(const trk::DensitySummary& density, const trk::Sidecar& sidecar) {
+VerifyReport verify(const trk::DensitySummary& density, const trk::Sidecar& sidecar,
+                    uint64_t maxMemory) {
     trk::VdbFile file(density.path);
     const trk::VdbEntry& entry =
         file.select(density.grid.name + "[" + std::to_string(density.grid.index) + "]");
     VerifyReport report;
     trk::withValueType(density.valueType, [&](auto zero) {
         using Value = decltype(zero);
-        trk::VdbTree<Value> tree(file, entry, 0);
-        const Voxels<Value> voxels(tree, density.anchor);
+        trk::VdbTree<Value> tree(file, entry, maxMemory);
+        Voxels<Value> voxels(tree, density.anchor, maxMemory);
         report = Verifier<Value>(voxels, sidecar).run();
     });
     return report;

@@ -25,28 +25,8 @@ std::array<double, C> ExtinctionField::integrate(const LocalRay& ray, double t0,
     std::array<double, C> sum{};
     table_.walk(ray, t0, t1, [&](Entry entry, const Int3& lo, int, double tEnter, double tExit) {
         ++regions;
-        if (isConstant(entry)) {
-            for (size_t c = 0; c < C; ++c) {
-                sum[c] += static_cast<double>(constant(entry)[c]) * (tExit - tEnter);
-            }
-            return true;
-        }
-        // Summed apart, so that it stays in registers.
-        std::array<double, C> part{};
         uint64_t cells = 0;
-        const auto add = [&](double, double, const std::array<double, C>& depth) {
-            ++cells;
-            for (size_t c = 0; c < C; ++c) {
-                part[c] += depth[c];
-            }
-            return true;
-        };
-        const size_t first = (entry - 1) * kBrickVertices * C;
-        if (isHalf()) {
-            walkBrick<C>(&halfs_[first], lo, ray, tEnter, tExit, add);
-        } else {
-            walkBrick<C>(&floats_[first], lo, ray, tEnter, tExit, add);
-        }
+        const std::array<double, C> part = integrateRegion<C>(entry, lo, ray, tEnter, tExit, cells);
         lookups += 2 * cells;
         for (size_t c = 0; c < C; ++c) {
             sum[c] += part[c];

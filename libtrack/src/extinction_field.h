@@ -51,6 +51,20 @@ inline uint16_t encodeHalf(float value) {
     return static_cast<uint16_t>((bits - (112u << 23)) >> 13);
 }
 
+/// Whether a type of storage holds a value exactly, and storing it.
+inline bool isStorable(float, const float*) {
+    return true;
+}
+inline bool isStorable(float value, const uint16_t*) {
+    return isExactHalf(value);
+}
+inline void storeExactly(float value, float& to) {
+    to = value;
+}
+inline void storeExactly(float value, uint16_t& to) {
+    to = encodeHalf(value);
+}
+
 /// Trilinear density over local space: voxel centres at integer coordinates, 0 outside, of one
 /// channel or three. Immutable.
 ///
@@ -154,6 +168,42 @@ class ExtinctionField {
     std::array<double, C> integrate(const LocalRay& ray, double t0, double t1, uint64_t& lookups,
                                     uint64_t& regions) const;
 
+    /// The same over the part of a ray in the region at `lo` that an entry stands for; adds the
+    /// cells of a brick to `cells`.
+    template <size_t C>
+    std::array<double, C> integrateRegion(Entry entry, const Int3& lo, const LocalRay& ray,
+                                          double t0, double t1, uint64_t& cells) const {
+        if (isConstant(entry)) {
+            std::array<double, C> depth;
+            for (size_t c = 0; c < C; ++c) {
+                depth[c] = static_cast<double>(constant(entry)[c]) * (t1 - t0);
+            }
+            return depth;
+        }
+        const size_t first = (entry - 1) * kBrickVertices * C;
+        return isHalf() ? integrateBrick<C>(&halfs_[first], lo, ray, t0, t1, cells)
+                        : integrateBrick<C>(&floats_[first], lo, ray, t0, t1, cells);
+    }
+
+    /// The same of a brick, wherever its values are.
+    template <size_t C, class Stored>
+    static std::array<double, C> integrateBrick(const Stored* brick, const Int3& lo,
+                                                const LocalRay& ray, double t0, double t1,
+                                                uint64_t& cells) {
+        std::array<double, C> depth{};
+        uint64_t met = 0;  // apart, so that it stays in a register
+        walkBrick<C>(brick, lo, ray, t0, t1,
+                     [&](double, double, const std::array<double, C>& cell) {
+                         ++met;
+                         for (size_t c = 0; c < C; ++c) {
+                             depth[c] += cell[c];
+                         }
+                         return true;
+                     });
+        cells += met;
+        return depth;
+    }
+
     /// Calls `visit(t0, t1, depth)` for every cell of a brick and every constant region on the
     /// ray's way where the density is not 0 throughout, until it answers false. `depth`: integral
     /// of the density over [t0, t1], in voxel lengths, in closed form.
@@ -202,7 +252,7 @@ class ExtinctionField {
     /// Visits the cells of one brick; whether to go on.
     template <size_t C, class Stored, class Visit>
     static bool walkBrick(const Stored* brick, const Int3& lo, const LocalRay& ray, double t0,
-                          double t1, Visit& visit);
+                          double t1, Visit&& visit);
 
     size_t channels_ = 1;
     SparseTable table_;
@@ -214,7 +264,7 @@ class ExtinctionField {
 
 template <size_t C, class Stored, class Visit>
 bool ExtinctionField::walkBrick(const Stored* brick, const Int3& lo, const LocalRay& ray, double t0,
-                                double t1, Visit& visit) {
+                                double t1, Visit&& visit) {
     constexpr std::ptrdiff_t kStride[3] = {81 * C, 9 * C, C};
     constexpr double kGauss = 0.57735026918962576451;  // 1/sqrt(3)
     double origin[3];

@@ -23,11 +23,12 @@ namespace {
 
 class Baker {
   public:
-    Baker(const ExtinctionField& field, const BakeOptions& options)
-        : field_(field),
+    Baker(BrickPages& pages, const BakeOptions& options)
+        : pages_(pages),
+          field_(pages.field()),
           options_(options),
           kind_(options.kind),
-          channels_(field.channels()),
+          channels_(field_.channels()),
           size_(options.superVoxelSize),
           cube_(std::min(options.superVoxelSize, 8)) {
         while (1 << shift_ < size_) {
@@ -40,8 +41,11 @@ class Baker {
         checkMemory();
         moments_.resize(jobs_.size() * channels_);
         corners_.resize(moments_.size());
+        const auto bricksOf = [&](size_t i, const auto& f) {
+            forEachCube(jobs_[i], [&](const Cube& cube) { f(cube.entry); });
+        };
         withEdge(static_cast<size_t>(cube_), [&](auto edge) {
-            forEach(jobs_.size(), [&](size_t i) {
+            pages_.forEach(jobs_.size(), kGrain, bricksOf, [&](size_t i) {
                 if (i % 1024 == 0) {
                     Progress::poll(static_cast<double>(i) / static_cast<double>(jobs_.size()));
                 }
@@ -57,21 +61,21 @@ class Baker {
             makeItems();
         }
         baked_.items.resize(itemJobs_.size() * channels_);
-        forEach(itemJobs_.size(), [&](size_t i) {
+        parallelFor(itemJobs_.size(), kGrain, [&](size_t i) {
             for (size_t c = 0; c < channels_; ++c) {
                 finish(i, c);
             }
         });
+        if (kind_ != ControlKind::kConstant) {
+            compareWithControl();
+        }
         return std::move(baked_);
     }
 
   private:
     using Entry = SparseTable::Entry;
 
-    template <class Body>
-    static void forEach(size_t count, const Body& body) {
-        parallelFor(count, 32, body);
-    }
+    static constexpr size_t kGrain = 32;
 
     /// Which super-voxels there are, equal ones once: their places in `jobs_`, in `plan_` the index
     /// of each, plus one.
@@ -117,10 +121,12 @@ class Baker {
 
     /// Of the jobs' moments, and of all that may be made of them.
     void checkMemory() const {
-        const size_t shape = (3 + shapeSize(kind_)) * sizeof(float);
-        const size_t perChannel =
-            sizeof(Moments) + sizeof(CornerMoments) + sizeof(BakedSuperVoxel) + shape;
-        const uint64_t wanted = field_.bytes() + 2 * plan_.bytes() +
+        constexpr uint64_t kFit = 250;  // of corners, a super-voxel
+        const uint64_t fit = kind_ == ControlKind::kTrilinear ? kFit : 0;
+        const uint64_t shape = (3 + shapeSize(kind_)) * sizeof(float);
+        const uint64_t perChannel =
+            sizeof(Moments) + sizeof(CornerMoments) + sizeof(BakedSuperVoxel) + shape + fit;
+        const uint64_t wanted = pages_.bytes() + 2 * plan_.bytes() +
                                 jobs_.size() * (sizeof(Int3) + channels_ * perChannel);
         if (options_.maxMemory > 0 && wanted > options_.maxMemory) {
             throw Error(TRK_ERROR_OUT_OF_MEMORY,
@@ -157,7 +163,7 @@ class Baker {
             std::fill(std::begin(buffer), std::end(buffer), field_.constant(cube.entry)[channel]);
             return buffer;
         }
-        return field_.brickChannel(cube.entry, channel, buffer) + cube.vertex;
+        return pages_.brickChannel(cube.entry, channel, buffer) + cube.vertex;
     }
 
     /// Moments of a job, in every channel.
@@ -386,9 +392,30 @@ class Baker {
         v.deviation = std::min(roundUp(std::sqrt(m.squares / cells + offset * offset)), reach);
         v.majorant = reach;
         v.rms = v.deviation;
-        if (kind_ != ControlKind::kConstant) {
-            compareWithControl(jobs_[job], channel, baked_.control(item * channels_ + channel), v);
+    }
+
+    /// What a control that is not constant leaves.
+    void compareWithControl() {
+        std::vector<size_t> items;  // with a residual, in the order of their jobs
+        for (size_t i = 0; i < itemJobs_.size(); ++i) {
+            if (!isHomogeneous(itemJobs_[i])) {
+                items.push_back(i);
+            }
         }
+        std::sort(items.begin(), items.end(),
+                  [&](size_t a, size_t b) { return itemJobs_[a] < itemJobs_[b]; });
+        const auto originOf = [&](size_t i) { return jobs_[itemJobs_[items[i]]]; };
+        const auto bricksOf = [&](size_t i, const auto& f) {
+            forEachCube(originOf(i), [&](const Cube& cube) { f(cube.entry); });
+        };
+        pages_.forEach(items.size(), kGrain, bricksOf, [&](size_t i) {
+            for (size_t c = 0; c < channels_; ++c) {
+                const size_t item = items[i] * channels_ + c;
+                if (baked_.items[item].min != baked_.items[item].max) {
+                    compareWithControl(originOf(i), c, baked_.control(item), baked_.items[item]);
+                }
+            }
+        });
     }
 
     /// Bound and RMS of what a control that is not constant leaves, vertex by vertex.
@@ -415,6 +442,7 @@ class Baker {
                          v.majorant);
     }
 
+    BrickPages& pages_;
     const ExtinctionField& field_;
     BakeOptions options_;
     ControlKind kind_;
@@ -432,11 +460,11 @@ class Baker {
 
 }  // namespace
 
-BakedVolume bake(const ExtinctionField& field, const BakeOptions& options) {
-    BakedVolume baked = Baker(field, options).bake();
-    addLevels(baked, field.box(), options.levels);
+BakedVolume bake(BrickPages pages, const BakeOptions& options) {
+    BakedVolume baked = Baker(pages, options).bake();
+    addLevels(baked, pages.field().box(), options.levels);
     if (options.sidecarBytes > 0) {
-        addPreview(baked, field, options.sidecarBytes);
+        addPreview(baked, pages, options.sidecarBytes);
     }
     return baked;
 }
@@ -450,7 +478,7 @@ uint64_t sidecarLimit(uint64_t sourceBytes, ControlKind kind) {
            (kind == ControlKind::kConstant ? 0 : kMoreGrids);
 }
 
-SidecarHeader sidecarHeader(const DensitySummary& source, const ExtinctionField& field,
+SidecarHeader sidecarHeader(const DensitySummary& source, BrickPages pages,
                             const BakedVolume& baked) {
     SidecarHeader header;
     header.toolVersion = TRACK_VERSION;
@@ -466,16 +494,17 @@ SidecarHeader sidecarHeader(const DensitySummary& source, const ExtinctionField&
     header.levels = static_cast<int>(baked.levels.size());
     header.controlKind = baked.kind;
     header.previewSize = baked.previewSize;
-    header.previewScale = previewScale(field, source.indexToWorld);
+    header.previewScale = previewScale(std::move(pages), source.indexToWorld);
     header.repair = source.repair;
     header.dropped = source.dropped;
     header.clamped = source.clamped;
     return header;
 }
 
-SidecarHeader writeBake(const OutputFile& file, const DensitySummary& source,
-                        const ExtinctionField& field, BakedVolume& baked, uint64_t sidecarBytes) {
-    const SidecarHeader header = sidecarHeader(source, field, baked);
+SidecarHeader writeBake(const OutputFile& file, const DensitySummary& source, BrickPages pages,
+                        BakedVolume& baked, uint64_t sidecarBytes) {
+    const ExtinctionField& field = pages.field();
+    const SidecarHeader header = sidecarHeader(source, std::move(pages), baked);
     writeSidecar(file, header, baked, source.anchor);
     // How well values compress was an estimate.
     while (baked.previewSize > 0 && std::filesystem::file_size(file.path()) > sidecarBytes) {

@@ -2,6 +2,7 @@
 // Statistics, control and preview levels of a density: what a sidecar stores.
 #pragma once
 
+#include "../brick_pages.h"
 #include "../extinction_field.h"
 #include "../io/sidecar.h"
 #include "../super_voxels.h"
@@ -25,21 +26,22 @@ struct BakeOptions {
     uint64_t maxMemory = 0;  ///< what field and bake may take together, in bytes; 0: no limit
 };
 
-/// Bakes a field, in parallel. The result has the same bits for any number of threads, and with or
-/// without tiles in the source. Throws Error: OUT_OF_MEMORY beyond maxMemory.
-BakedVolume bake(const ExtinctionField& field, const BakeOptions& options);
+/// Bakes a field, in parallel. The result has the same bits for any number of threads, with or
+/// without tiles in the source, and whether the field holds its bricks. Throws Error: OUT_OF_MEMORY
+/// beyond maxMemory.
+BakedVolume bake(BrickPages pages, const BakeOptions& options);
 
 /// How large a sidecar of a density of `sourceBytes` as a file may be, pictures included.
 uint64_t sidecarLimit(uint64_t sourceBytes, ControlKind kind);
 
 /// What a sidecar of such a bake says of itself.
-SidecarHeader sidecarHeader(const DensitySummary& source, const ExtinctionField& field,
+SidecarHeader sidecarHeader(const DensitySummary& source, BrickPages pages,
                             const BakedVolume& baked);
 
 /// Writes a bake as a sidecar of at most `sidecarBytes`, for which its pictures become coarser
 /// where they must. Does not commit.
-SidecarHeader writeBake(const OutputFile& file, const DensitySummary& source,
-                        const ExtinctionField& field, BakedVolume& baked, uint64_t sidecarBytes);
+SidecarHeader writeBake(const OutputFile& file, const DensitySummary& source, BrickPages pages,
+                        BakedVolume& baked, uint64_t sidecarBytes);
 
 /// How well a bake's control fits, over all occupied super-voxels and channels.
 struct ControlFit {

@@ -83,9 +83,10 @@ ValueTable nextLevel(const SparseTable& finer, const IntBox& box, size_t channel
 }
 
 /// Means of the cubes of 2^shift cells of a field.
-ValueTable meansOf(const ExtinctionField& field, int shift) {
+ValueTable meansOf(BrickPages& pages, int shift) {
+    const ExtinctionField& field = pages.field();
     if (shift > ExtinctionField::kBrickShift) {
-        const ValueTable finer = meansOf(field, shift - 1);
+        const ValueTable finer = meansOf(pages, shift - 1);
         return nextLevel(finer.table, field.box(), field.channels(), [&](size_t item, size_t c) {
             return finer.values[item * field.channels() + c];
         });
@@ -94,12 +95,14 @@ ValueTable meansOf(const ExtinctionField& field, int shift) {
     const auto edge = static_cast<size_t>(1) << shift;
     const size_t perAxis = 8 / edge;
     const size_t cubes = perAxis * perAxis * perAxis;
-    std::vector<float> brickMeans(field.brickCount() * cubes * channels);
-    parallelFor(field.brickCount(), 32, [&](size_t b) {
+    const std::vector<SparseTable::Entry> bricks = pages.bricks();
+    std::vector<float> brickMeans((bricks.empty() ? 0 : bricks.back()) * cubes * channels);
+    const auto bricksOf = [&](size_t i, const auto& f) { f(bricks[i]); };
+    pages.forEach(bricks.size(), 32, bricksOf, [&](size_t i) {
+        const size_t b = bricks[i] - 1;
         float buffer[ExtinctionField::kBrickVertices];
         for (size_t c = 0; c < channels; ++c) {
-            const float* brick =
-                field.brickChannel(static_cast<SparseTable::Entry>(b + 1), c, buffer);
+            const float* brick = pages.brickChannel(bricks[i], c, buffer);
             withEdge(edge, [&](auto m) {
                 for (size_t k = 0; k < cubes; ++k) {
                     const float* cube = cubeRow(brick, k / (perAxis * perAxis) * edge,
@@ -182,7 +185,9 @@ void addLevels(BakedVolume& baked, const IntBox& box, int count) {
     }
 }
 
-void addPreview(BakedVolume& baked, const ExtinctionField& field, uint64_t sidecarBytes) {
+void addPreview(BakedVolume& baked, BrickPages& pages, uint64_t sidecarBytes) {
+    const ExtinctionField& field = pages.field();
+    const auto brickCount = static_cast<double>(pages.bricks().size());
     constexpr int64_t kFinest =
         160;                       // cubes along the longest edge: about three pixels of 512 each
     constexpr double kCube = 3.9;  // bytes a channel, of values and their nodes
@@ -193,12 +198,11 @@ void addPreview(BakedVolume& baked, const ExtinctionField& field, uint64_t sidec
     const int64_t extent = largestExtent(field.box());
     for (int shift = 0; shift < baked.superVoxelShift; ++shift) {
         // Bricks may hold much emptiness, but not so much.
-        const double most = static_cast<double>(field.brickCount()) *
-                            std::pow(8.0, ExtinctionField::kBrickShift - shift);
+        const double most = brickCount * std::pow(8.0, ExtinctionField::kBrickShift - shift);
         if (extent >> shift > kFinest || bytesOf(most / 4) > room) {
             continue;
         }
-        ValueTable means = meansOf(field, shift);
+        ValueTable means = meansOf(pages, shift);
         if (bytesOf(static_cast<double>(means.table.occupiedItems())) <= room) {
             baked.previewSize = 1 << shift;
             baked.preview = std::move(means);

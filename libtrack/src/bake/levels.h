@@ -3,6 +3,7 @@
 // super-voxels.
 #pragma once
 
+#include "../brick_pages.h"
 #include "../extinction_field.h"
 #include "../super_voxels.h"
 
@@ -17,7 +18,7 @@ void addLevels(BakedVolume& baked, const IntBox& box, int count);
 /// Adds means of cubes smaller than super-voxels, where the latter are too large for a picture: as
 /// fine as shows in one of 512 pixels, and as keeps the whole bake as a file within `sidecarBytes`,
 /// by estimate.
-void addPreview(BakedVolume& baked, const ExtinctionField& field, uint64_t sidecarBytes);
+void addPreview(BakedVolume& baked, BrickPages& pages, uint64_t sidecarBytes);
 
 /// Makes the cubes for pictures twice as large, or where they would be as large as super-voxels
 /// drops them.

@@ -1,41 +1,79 @@
 // SPDX-License-Identifier: Apache-2.0
 #include "preview_scale.h"
 
-#include "../parallel.h"
-
 #include <algorithm>
-#include <array>
 #include <charconv>
 #include <cmath>
 #include <cstdio>
 #include <cstring>
+#include <numeric>
+#include <tuple>
+#include <type_traits>
 #include <vector>
 
 namespace trk {
 namespace {
 
-/// Integral of the density (the mean over channels) along the line of an axis through a place,
-/// times the length of a voxel along it.
-double depthThrough(const ExtinctionField& field, const Vec3d& place, int axis, double voxel) {
+/// The line of an axis through a place, from side to side of a field's box.
+LocalRay lineThrough(const IntBox& box, const Vec3d& place, int axis) {
     LocalRay ray;
     ray.origin = place;
-    const IntBox& box = field.box();
     for (int a = 0; a < 3; ++a) {
         ray.direction[a] = a == axis ? 1 : 0;
         ray.inverse[a] = a == axis ? 1 : 1e300;
     }
     ray.origin[axis] = static_cast<double>(box.lo[static_cast<size_t>(axis)]);
     ray.tEnd = static_cast<double>(box.hi[static_cast<size_t>(axis)]) - ray.origin[axis];
-    uint64_t ignored = 0;
-    double sum = 0;
-    if (field.channels() == 1) {
-        sum = field.integrate<1>(ray, 0, ray.tEnd, ignored, ignored)[0];
-    } else {
-        for (const double d : field.integrate<3>(ray, 0, ray.tEnd, ignored, ignored)) {
-            sum += d / 3;
-        }
+    return ray;
+}
+
+/// What of a line lies in a region of one entry, and the integral of the density there (the mean
+/// over channels).
+struct Piece {
+    SparseTable::Entry entry;
+    uint32_t line;
+    Int3 lo;
+    double t0;
+    double t1;
+    double depth;
+};
+
+/// Integrals of the density along lines, in voxel lengths.
+std::vector<double> depthsAlong(BrickPages& pages, const std::vector<LocalRay>& lines) {
+    std::vector<Piece> pieces;
+    for (size_t i = 0; i < lines.size(); ++i) {
+        pages.field().table().walk(
+            lines[i], 0, lines[i].tEnd,
+            [&](SparseTable::Entry entry, const Int3& lo, int, double t0, double t1) {
+                pieces.push_back({entry, static_cast<uint32_t>(i), lo, t0, t1, 0});
+                return true;
+            });
     }
-    return sum * voxel;
+    std::vector<uint32_t> order(pieces.size());  // a brick's pieces side by side
+    std::iota(order.begin(), order.end(), 0u);
+    std::sort(order.begin(), order.end(), [&](uint32_t a, uint32_t b) {
+        return std::tie(pieces[a].entry, a) < std::tie(pieces[b].entry, b);
+    });
+    const auto bricksOf = [&](size_t i, const auto& f) { f(pieces[order[i]].entry); };
+    pages.forEach(pieces.size(), 64, bricksOf, [&](size_t i) {
+        Piece& piece = pieces[order[i]];
+        const LocalRay& line = lines[piece.line];
+        const auto depth = [&](auto channels) {
+            double sum = 0;
+            for (const double d :
+                 pages.integrate<channels>(piece.entry, piece.lo, line, piece.t0, piece.t1)) {
+                sum += d / static_cast<double>(channels);
+            }
+            return sum;
+        };
+        piece.depth = pages.field().channels() == 1 ? depth(std::integral_constant<size_t, 1>{})
+                                                    : depth(std::integral_constant<size_t, 3>{});
+    });
+    std::vector<double> depths(lines.size(), 0);
+    for (const Piece& piece : pieces) {
+        depths[piece.line] += piece.depth;
+    }
+    return depths;
 }
 
 /// The nearest number of two digits, as it is written.
@@ -49,7 +87,8 @@ double twoDigits(double value) {
 
 }  // namespace
 
-double previewScale(const ExtinctionField& field, const AffineMap& indexToWorld) {
+double previewScale(BrickPages pages, const AffineMap& indexToWorld) {
+    const ExtinctionField& field = pages.field();
     constexpr size_t kPlaces = 1024;
     size_t count = 0;
     field.table().forEach([&](const Int3&, int, SparseTable::Entry) { ++count; });
@@ -66,11 +105,16 @@ double previewScale(const ExtinctionField& field, const AffineMap& indexToWorld)
         }
         centres.push_back(centre);
     });
-    std::vector<double> depths(3 * centres.size());
-    parallelFor(depths.size(), 16, [&](size_t k) {
-        const int axis = static_cast<int>(k % 3);
-        depths[k] = depthThrough(field, centres[k / 3], axis, length(indexToWorld.column(axis)));
-    });
+    std::vector<LocalRay> lines;
+    for (const Vec3d& centre : centres) {
+        for (int axis = 0; axis < 3; ++axis) {
+            lines.push_back(lineThrough(field.box(), centre, axis));
+        }
+    }
+    std::vector<double> depths = depthsAlong(pages, lines);
+    for (size_t k = 0; k < depths.size(); ++k) {
+        depths[k] *= length(indexToWorld.column(static_cast<int>(k % 3)));
+    }
     depths.erase(std::remove_if(depths.begin(), depths.end(), [](double d) { return !(d > 0); }),
                  depths.end());
     if (depths.empty()) {

@@ -5,9 +5,12 @@
 #include "density_types.h"
 #include "field_builder.h"
 #include "memory_source.h"
+#include "tree_bricks.h"
 #include "vdb_file.h"
 #include "vdb_tree.h"
 
+#include <algorithm>
+#include <memory>
 #include <sstream>
 #include <utility>
 #include <vector>
@@ -92,16 +95,10 @@ void checkValues(const RegionScan& scan, uint32_t repair, const std::string& whe
     }
 }
 
-/// The field of a source, and what was found on the way.
-template <class Value>
-Density fromSource(RegionSource<Value>& source, uint32_t repair, uint64_t maxMemory,
-                   const std::string& where) {
-    checkBackground(source.background(), where);
-    FieldBuilder<Value> builder(source, maxMemory, where);
-    const RegionScan& scan = builder.scan();
+/// What a pass over a source found, with the repairs allowed. Throws where it is no density.
+DensitySummary summaryOf(const RegionScan& scan, uint32_t repair, const std::string& where) {
     checkValues(scan, repair, where);
-    Density density;
-    DensitySummary& summary = density.summary;
+    DensitySummary summary;
     summary.digest = scan.digest;
     summary.activeVoxels = scan.activeVoxels;
     summary.min = scan.min;
@@ -110,7 +107,59 @@ Density fromSource(RegionSource<Value>& source, uint32_t repair, uint64_t maxMem
     summary.dropped = scan.nonfinite.count;
     summary.clamped = scan.negative.count;
     summary.anchor = anchorFor(scan.box);
-    density.field = builder.build(summary.anchor);
+    return summary;
+}
+
+/// The field of a source, and what was found on the way.
+template <class Value>
+Density fromSource(RegionSource<Value>& source, uint32_t repair, uint64_t maxMemory,
+                   const std::string& where) {
+    checkBackground(source.background(), where);
+    FieldBuilder<Value> builder(source, maxMemory, where);
+    Density density;
+    density.summary = summaryOf(builder.scan(), repair, where);
+    density.field = builder.build(density.summary.anchor);
+    return density;
+}
+
+/// Whether the bricks of a tree, and a bake, may have no room.
+template <class Value>
+bool mayNotFit(const VdbTree<Value>& tree, uint64_t maxMemory) {
+    const uint64_t stored = tree.isHalf() ? sizeof(uint16_t) : sizeof(float);
+    const uint64_t brick = ExtinctionField::kBrickVertices * ValueTraits<Value>::kChannels * stored;
+    // Those beside leaves, and what is made of them.
+    return maxMemory > 0 && tree.leafCount() * brick / 2 * 3 + tree.listBytes() > maxMemory;
+}
+
+template <class Value>
+Density fromTree(std::unique_ptr<VdbFile> file, const VdbEntry& entry,
+                 const DensityOptions& options, const std::string& where) {
+    auto tree = std::make_unique<VdbTree<Value>>(*file, entry, options.maxMemory);
+    const uint64_t gridBytes = tree->openvdbBytes();
+    Density density;
+    if (options.bricks == Bricks::kAll ||
+        (options.bricks == Bricks::kAllThatFit && !mayNotFit(*tree, options.maxMemory))) {
+        density = fromSource(*tree, options.repair, options.maxMemory, where);
+    } else {
+        checkBackground(tree->background(), where);
+        checkLeafCount(*tree, where);
+        LeafTraits<Value> leaves;
+        const bool loads = options.bricks != Bricks::kNone;
+        if (loads) {
+            leaves.resize(tree->leafCount());
+        }
+        const RegionScan scan = scanRegions(*tree, loads ? &leaves : nullptr);
+        density.summary = summaryOf(scan, options.repair, where);
+        if (loads) {
+            auto bricks = std::make_unique<TreeBricks<Value>>(
+                std::move(file), std::move(tree), std::move(leaves), scan, density.summary.anchor);
+            density.field = bricks->field();
+            density.loader = std::move(bricks);
+            constexpr uint64_t kLeast = uint64_t{12} << 20;  // several super-voxels of 64^3
+            density.pageBytes = std::max(options.maxMemory / 4, kLeast);
+        }
+    }
+    density.summary.gridBytes = gridBytes;
     return density;
 }
 
@@ -139,22 +188,22 @@ void checkKind(const std::string& treeType, const std::string& gridClass,
 }
 
 Density loadDensity(const std::string& path, const DensityOptions& options) {
-    VdbFile file(path);
-    const VdbEntry& entry = choose(file, options);
-    const std::string where = path + ": grid " + entry.label();
-    const VdbGridHeader header = file.readHeader(entry);
-    checkKind(entry.type, header.gridClass(), where);
+    auto file = std::make_unique<VdbFile>(path);
+    const VdbEntry& chosen = choose(*file, options);
+    const std::string where = path + ": grid " + chosen.label();
+    const VdbGridHeader header = file->readHeader(chosen);
+    checkKind(chosen.type, header.gridClass(), where);
     const AffineMap map = affineMap(*header.transform, where);
+    const VdbEntry entry = chosen;  // a loader takes the file
+    const uint64_t fileBytes = file->bytes();
+    const int64_t fileModified = file->modified();
     const std::string valueType = valueTypeName(entry.type);
     Density density = withValueType(valueType, [&](auto zero) {
-        VdbTree<decltype(zero)> tree(file, entry, options.maxMemory);
-        Density loaded = fromSource(tree, options.repair, options.maxMemory, where);
-        loaded.summary.gridBytes = tree.openvdbBytes();
-        return loaded;
+        return fromTree<decltype(zero)>(std::move(file), entry, options, where);
     });
     density.summary.path = path;
-    density.summary.fileBytes = file.bytes();
-    density.summary.fileModified = file.modified();
+    density.summary.fileBytes = fileBytes;
+    density.summary.fileModified = fileModified;
     density.summary.grid = {entry.name, entry.index};
     density.summary.label = entry.label();
     density.summary.valueType = valueType;

@@ -2,20 +2,31 @@
 // The one loader, for baking and for queries: a grid of a .vdb file becomes an extinction field.
 #pragma once
 
+#include "../brick_pages.h"
 #include "../extinction_field.h"
 #include "../geometry.h"
 #include "../volume.h"
 
 #include <cstdint>
+#include <memory>
 #include <string>
 
 namespace trk {
+
+/// What is held of a density's bricks once it is loaded.
+enum class Bricks {
+    kAll,
+    kAllThatFit,  ///< all, or where maxMemory has no room for them a loader
+    kLoader,      ///< a loader
+    kNone,        ///< nothing but the summary
+};
 
 struct DensityOptions {
     bool gridNamed = false;
     std::string gridName;    ///< NAME or NAME[i], where gridNamed
     uint32_t repair = 0;     ///< TRK_REPAIR_… bits
     uint64_t maxMemory = 0;  ///< 0: no limit
+    Bricks bricks = Bricks::kAll;
 };
 
 /// What is known of a source grid besides its values.
@@ -41,7 +52,14 @@ struct DensitySummary {
 
 struct Density {
     DensitySummary summary;
-    ExtinctionField field;  ///< in local space: index space minus summary.anchor
+    ExtinctionField field;                ///< in local space: index space minus summary.anchor
+    std::unique_ptr<BrickLoader> loader;  ///< of the field's bricks, where it holds none
+
+    uint64_t pageBytes = 0;  ///< and of a page of them
+
+    BrickPages pages() const {
+        return loader ? BrickPages(field, *loader, pageBytes) : BrickPages(field);
+    }
 };
 
 /// Loads, checks and converts a grid, in parallel. Without a name: the only grid that could be a

@@ -3,6 +3,7 @@
 // extent.
 #pragma once
 
+#include "../failure.h"
 #include "../geometry.h"
 #include "../hash.h"
 #include "density_types.h"
@@ -13,6 +14,7 @@
 #include <cmath>
 #include <cstdint>
 #include <limits>
+#include <string>
 
 namespace trk {
 
@@ -39,6 +41,15 @@ struct RegionScan {
     float max = 0;
     IntBox box;  ///< index space; cells where the trilinear field may differ from 0
 
+    /// The box in space relative to `anchor`.
+    IntBox localBox(const Int3& anchor) const {
+        IntBox local = box;
+        for (size_t a = 0; a < 3; ++a) {
+            local.lo[a] -= anchor[a];
+            local.hi[a] -= anchor[a];
+        }
+        return local;
+    }
     void addRange(float lo, float hi) {
         min = any ? std::min(min, lo) : lo;
         max = any ? std::max(max, hi) : hi;
@@ -135,6 +146,14 @@ void scanTile(const Tile<Value>& tile, RegionScan& scan) {
     scanValue(tile.value, {{tile.origin[0], tile.origin[1], tile.origin[2]}}, voxels, scan);
     if (!(tile.value == Value{})) {
         addSupport(tile.origin, size, scan);
+    }
+}
+
+/// Leaves are counted in 27 bits wherever bricks are.
+template <class Value>
+void checkLeafCount(const RegionSource<Value>& source, const std::string& where) {
+    if (source.leafCount() >= size_t{1} << 27) {
+        throw Error(TRK_ERROR_OUT_OF_MEMORY, where + ": has more than 2^27 leaves of 8^3 voxels");
     }
 }
 

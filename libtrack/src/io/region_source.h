@@ -29,7 +29,9 @@ struct LeafBatch {
     size_t count;
     const uint64_t* masks;
     const Value* values;
+    const uint32_t* some = nullptr;  ///< which leaves these are, where they do not follow `first`
 
+    size_t index(size_t i) const { return some ? some[i] : first + i; }
     const uint64_t* mask(size_t i) const { return masks + 8 * i; }
     const Value* leaf(size_t i) const { return values + kLeafVoxels * i; }
 };

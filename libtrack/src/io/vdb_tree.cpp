@@ -216,7 +216,33 @@ void VdbTree<Value>::readRoot() {
 }
 
 template <class Value>
-void VdbTree<Value>::forEachBatch(const std::function<void(const LeafBatch<Value>&)>& body) {
+void VdbTree<Value>::forEachBatch(const Body& body) {
+    FileReader& reader = file_.reader();
+    reader.setPlace(place_);
+    reader.confine(valuesStart_, end_);
+    positions_.resize(this->leafCount());
+    passOver(
+        this->leafCount(), nullptr, [&](size_t leaf) { positions_[leaf] = reader.position(); },
+        body);
+    if (reader.remaining() != 0) {
+        reader.refuse("its leaves end here, but the grid is said to go on for " +
+                      std::to_string(reader.remaining()) + " bytes");
+    }
+}
+
+template <class Value>
+void VdbTree<Value>::forEachBatchOf(const std::vector<uint32_t>& leaves, const Body& body) {
+    FileReader& reader = file_.reader();
+    reader.setPlace(place_);
+    passOver(
+        leaves.size(), leaves.data(), [&](size_t leaf) { reader.confine(positions_[leaf], end_); },
+        body);
+}
+
+template <class Value>
+template <class Find>
+void VdbTree<Value>::passOver(size_t leafCount, const uint32_t* some, const Find& find,
+                              const Body& body) {
     constexpr size_t kBatch = 64;
     struct Batch {
         size_t first = 0;
@@ -225,24 +251,24 @@ void VdbTree<Value>::forEachBatch(const std::function<void(const LeafBatch<Value
         std::vector<char> bytes;
     };
     FileReader& reader = file_.reader();
-    reader.setPlace(place_);
-    reader.confine(valuesStart_, end_);
     size_t next = 0;
     const auto take = [&](tbb::flow_control& control) -> std::shared_ptr<Batch> {
-        if (next == this->leafCount()) {
+        if (next == leafCount) {
             control.stop();
             return nullptr;
         }
         auto batch = std::make_shared<Batch>();
         batch->first = next;
-        const size_t count = std::min(kBatch, this->leafCount() - next);
+        const size_t count = std::min(kBatch, leafCount - next);
         batch->masks.resize(8 * count);
         batch->bytes.reserve(count * (sizeof(Value) * 512 / 2));
         for (size_t i = 0; i < count; ++i, ++next) {
+            const size_t at = some ? some[next] : next;
+            find(at);
             uint64_t* mask = &batch->masks[8 * i];
             reader.read(mask, kLeafMaskBytes);
-            if (hashWords(mask, 8, 0) != maskHashes_[next]) {
-                reader.refuse("the mask of leaf " + text(this->leafOrigins_[next]) +
+            if (hashWords(mask, 8, 0) != maskHashes_[at]) {
+                reader.refuse("the mask of leaf " + text(this->leafOrigins_[at]) +
                               " is not that of the topology");
             }
             size_t active = 0;
@@ -279,12 +305,13 @@ void VdbTree<Value>::forEachBatch(const std::function<void(const LeafBatch<Value
                                     LeafBatch<Value>::kLeafVoxels, this->background_,
                                     &scratch->values[i * LeafBatch<Value>::kLeafVoxels], place_);
         }
-        body({batch->first, batch->packed.size(), batch->masks.data(), scratch->values.data()});
+        body({batch->first, batch->packed.size(), batch->masks.data(), scratch->values.data(),
+              some ? some + batch->first : nullptr});
         {
             const tbb::spin_mutex::scoped_lock lock(idleLock);
             idle.push_back(std::move(scratch));
         }
-        Progress::poll(static_cast<double>(batch->first) / static_cast<double>(this->leafCount()));
+        Progress::poll(static_cast<double>(batch->first) / static_cast<double>(leafCount));
     };
     tbb::task_group_context context(tbb::task_group_context::isolated);
     const auto tokens = 2 * static_cast<size_t>(tbb::this_task_arena::max_concurrency());
@@ -293,10 +320,6 @@ void VdbTree<Value>::forEachBatch(const std::function<void(const LeafBatch<Value
         tbb::make_filter<void, std::shared_ptr<Batch>>(tbb::filter_mode::serial_in_order, take) &
             tbb::make_filter<std::shared_ptr<Batch>, void>(tbb::filter_mode::parallel, decode),
         context);
-    if (reader.remaining() != 0) {
-        reader.refuse("its leaves end here, but the grid is said to go on for " +
-                      std::to_string(reader.remaining()) + " bytes");
-    }
 }
 
 template <class Value>

@@ -14,7 +14,7 @@
 namespace trk {
 
 /// A grid of a file as a source of regions. `Value`: float, double, openvdb::Vec3f or Vec3d. The
-/// file must live as long. Memory: 20 bytes a leaf and what tiles take; while leaves come by, a few
+/// file must live as long. Memory: 28 bytes a leaf and what tiles take; while leaves come by, a few
 /// batches of them.
 template <class Value>
 class VdbTree : public RegionSource<Value> {
@@ -23,10 +23,15 @@ class VdbTree : public RegionSource<Value> {
     /// its leaves and tiles alone would take more than `maxMemory` bytes (0: no limit).
     VdbTree(VdbFile& file, const VdbEntry& entry, uint64_t maxMemory);
 
-    void forEachBatch(const std::function<void(const LeafBatch<Value>&)>& body) override;
+    using Body = std::function<void(const LeafBatch<Value>&)>;
+    void forEachBatch(const Body& body) override;
+
+    /// The same of some leaves alone, by their places among leafOrigins(), which rise. To be called
+    /// after forEachBatch, which finds where they are.
+    void forEachBatchOf(const std::vector<uint32_t>& leaves, const Body& body);
 
     size_t listBytes() const override {
-        return RegionSource<Value>::listBytes() + maskHashes_.size() * sizeof(uint64_t);
+        return RegionSource<Value>::listBytes() + 2 * maskHashes_.size() * sizeof(uint64_t);
     }
 
     /// What OpenVDB holds in memory for such a tree.
@@ -48,6 +53,9 @@ class VdbTree : public RegionSource<Value> {
     void readUpper(const Origin& origin);
     void addTile(const Origin& origin, int shift, const Value& value, bool active);
     void checkMemory() const;
+    /// Calls body for `count` leaves, all or `some`; `find(leaf)` goes where the next one begins.
+    template <class Find>
+    void passOver(size_t count, const uint32_t* some, const Find& find, const Body& body);
 
     VdbFile& file_;
     std::string place_;
@@ -56,6 +64,7 @@ class VdbTree : public RegionSource<Value> {
     uint64_t valuesStart_ = 0;  // where the leaves' values begin
     uint64_t maxMemory_ = 0;
     std::vector<uint64_t> maskHashes_;  // of the leaves' masks in the topology
+    std::vector<uint64_t> positions_;   // of the leaves' values, once they came by
     uint64_t upperNodes_ = 0;
     uint64_t lowerNodes_ = 0;
     Node upper_;

@@ -46,11 +46,16 @@ std::vector<double> mapOf(const trk::AffineMap& map) {
     return numbers;
 }
 
+/// NAME[i], which is of one grid alone.
+std::string selectorOf(const trk::VdbEntry& entry) {
+    return entry.name + "[" + std::to_string(entry.index) + "]";
+}
+
 /// What the voxels of a grid that can be baked say.
 void addValues(const std::string& path, const trk::VdbEntry& entry, Json& json) {
     trk::DensityOptions options;
     options.gridNamed = true;
-    options.gridName = entry.name + "[" + std::to_string(entry.index) + "]";
+    options.gridName = selectorOf(entry);
     try {
         const trk::Density density = trk::loadDensity(path, options);
         json["active_voxels"] = density.summary.activeVoxels;
@@ -76,8 +81,33 @@ void addValues(const std::string& path, const trk::VdbEntry& entry, Json& json) 
     }
 }
 
-/// One grid: what its header says, and with `values` what its voxels say.
-Json describeGrid(trk::VdbFile& file, const trk::VdbEntry& entry, bool values) {
+/// What opening and baking a grid will need.
+Json estimateOf(const std::string& path, const trk::VdbEntry& entry) {
+    trk::DensityOptions options;
+    options.gridNamed = true;
+    options.gridName = selectorOf(entry);
+    const trk::DensityEstimate estimate = trk::estimateDensity(path, options);
+    const trk::BakeEstimate bake = trk::estimateBake(estimate.field, {});
+    Json json;
+    json["leaves"] = estimate.leaves;
+    json["tiles"] = estimate.tiles;
+    json["bricks"] = estimate.bricks;
+    json["open_bytes"] = estimate.heldBytes;
+    json["open_peak_bytes"] = estimate.peakBytes;
+    json["super_voxels"] = bake.superVoxels;
+    json["bake_bytes"] = std::max(estimate.peakBytes, estimate.heldBytes + bake.bytes);
+    json["least_bake_bytes"] = estimate.loaderBytes + bake.bytes;
+    return json;
+}
+
+/// What is to be said of grids beside their headers.
+struct Wanted {
+    bool values = false;
+    bool estimate = false;
+};
+
+/// One grid.
+Json describeGrid(trk::VdbFile& file, const trk::VdbEntry& entry, const Wanted& wanted) {
     Json json;
     json["grid"] = entry.rawLabel();
     json["type"] = entry.type;
@@ -107,7 +137,10 @@ Json describeGrid(trk::VdbFile& file, const trk::VdbEntry& entry, bool values) {
         json["reason"] = std::string(e.what()).substr(where.size() + 2);
         return json;
     }
-    if (values) {
+    if (wanted.estimate) {
+        json["estimate"] = estimateOf(file.path(), entry);
+    }
+    if (wanted.values) {
         addValues(file.path(), entry, json);
     }
     return json;
@@ -281,6 +314,17 @@ void printGrid(const Json& grid) {
                                grid["brick_storage"].get<std::string>() + " bricks, " +
                                byteCount(grid["openvdb_bytes"]) + " in OpenVDB");
     }
+    if (grid.contains("estimate")) {
+        const Json& e = grid["estimate"];
+        printRow("structure", e["leaves"].dump() + " leaves and " + e["tiles"].dump() +
+                                  " tiles; at most " + e["bricks"].dump() + " bricks");
+        printRow("to open", "at most " + byteCount(e["open_bytes"]) + ", " +
+                                byteCount(e["open_peak_bytes"]) + " meanwhile");
+        printRow("to bake", "at most " + byteCount(e["bake_bytes"]) +
+                                ", or more slowly with --max-memory of " +
+                                byteCount(e["least_bake_bytes"]) + " and more (" +
+                                e["super_voxels"].dump() + " super-voxels of 16^3, constant)");
+    }
     printRow("bake", grid["can_be_baked"].is_null() ? "yes, if its values are fit"
                      : grid["can_be_baked"].get<bool>()
                          ? "yes"
@@ -322,13 +366,14 @@ void run(const Command& command, const std::vector<std::string>& given) {
     options.add_options()("json", po::bool_switch(), "machine-readable")(
         "values", po::bool_switch(),
         "read the voxels too: how many, their range and bounds, memory, and how well a control "
-        "fits");
+        "fits")("estimate", po::bool_switch(),
+                "tell, by its structure alone, what memory opening and baking a density will need");
     const Arguments arguments(command, given, options, {"FILE.vdb"}, 1);
     const std::string path = arguments.text("FILE.vdb");
-    const bool values = arguments.flag("values");
+    const Wanted wanted{arguments.flag("values"), arguments.flag("estimate")};
     Json json;
     if (trk::isSidecar(path)) {
-        json = describeSidecar(path, values);
+        json = describeSidecar(path, wanted.values);
     } else {
         trk::VdbFile file(path);
         json["file"] = path;
@@ -338,7 +383,7 @@ void run(const Command& command, const std::vector<std::string>& given) {
         json["creator"] = file.header().creator;
         json["grids"] = Json::array();
         for (const trk::VdbEntry& entry : file.entries()) {
-            json["grids"].push_back(describeGrid(file, entry, values));
+            json["grids"].push_back(describeGrid(file, entry, wanted));
         }
     }
     if (arguments.flag("json")) {
@@ -362,7 +407,7 @@ void run(const Command& command, const std::vector<std::string>& given) {
 
 }  // namespace
 
-const Command kInfoCommand{"info", "vdbtrack info FILE.vdb [--values] [--json]",
+const Command kInfoCommand{"info", "vdbtrack info FILE.vdb [--values] [--estimate] [--json]",
                            "Tells what a .vdb file or a sidecar holds: by its headers, or with "
                            "--values by its voxels too.",
                            run};

@@ -1,8 +1,10 @@
 // SPDX-License-Identifier: Apache-2.0
 #include "procedural.h"
 
+#include "failure.h"
 #include "geometry.h"
 #include "io/density_types.h"
+#include "io/tree_encoder.h"
 #include "io/vdb_writer.h"
 #include "parallel.h"
 
@@ -10,8 +12,11 @@
 #include <array>
 #include <atomic>
 #include <cmath>
+#include <fstream>
 #include <memory>
 #include <random>
+#include <string>
+#include <vector>
 
 namespace vdbtools {
 namespace {
@@ -265,60 +270,85 @@ std::unique_ptr<Shape> makeShape(const ProceduralOptions& options) {
     return std::make_unique<Cloud>(options.seed);
 }
 
-/// The shape as a grid, leaf by leaf.
-template <class GridType>
-typename GridType::Ptr makeGrid(const Shape& shape, int voxels,
-                                const std::function<void(double)>& progress) {
-    using Value = typename GridType::ValueType;
-    using Leaf = typename GridType::TreeType::LeafNodeType;
+/// One leaf of a shape: its mask and its buffer as the file has them. No active voxel, no buffer.
+template <class Value>
+void makeLeaf(const Shape& shape, int voxels, trk::LeafPlace& leaf, std::string& buffer) {
     const double voxel = 1.0 / voxels;  // in the unit cube
-    const int blocks = (voxels + 7) / 8;
-    std::vector<std::unique_ptr<Leaf>> leaves(
-        static_cast<size_t>(blocks) * static_cast<size_t>(blocks) * static_cast<size_t>(blocks));
-    const auto fill = [&](Leaf& leaf) {
-        for (openvdb::Index i = 0; i < Leaf::SIZE; ++i) {
-            const openvdb::Coord at = leaf.offsetToGlobalCoord(i);
-            if (std::max({at.x(), at.y(), at.z()}) >= voxels) {
-                continue;
-            }
-            const Vec3d p{{(at.x() + 0.5) * voxel, (at.y() + 0.5) * voxel, (at.z() + 0.5) * voxel}};
-            trk::Sample<Value> sample{};
-            bool any = false;
-            for (size_t c = 0; c < sample.size(); ++c) {
-                const double d = shape.density(p, static_cast<int>(c));
-                sample[c] = d > kLeast ? static_cast<float>(d) : 0.0f;
-                any = any || d > kLeast;
-            }
-            if (any) {
-                leaf.setValueOn(i, trk::fromFloats<Value>(sample.data()));
-            }
+    const auto centreOf = [&](size_t axis, double at) { return (leaf.origin[axis] + at) * voxel; };
+    leaf.mask = {};
+    if (shape.emptyAround({{centreOf(0, 4), centreOf(1, 4), centreOf(2, 4)}}, 7 * voxel)) {
+        return;
+    }
+    std::array<Value, 512> values;
+    values.fill(openvdb::zeroVal<Value>());
+    for (size_t i = 0; i < values.size(); ++i) {
+        const size_t at[3] = {i >> 6, i >> 3 & 7, i & 7};
+        Vec3d p;
+        bool inside = true;
+        for (size_t a = 0; a < 3; ++a) {
+            inside = inside && leaf.origin[a] + static_cast<int>(at[a]) < voxels;
+            p[static_cast<int>(a)] = centreOf(a, static_cast<double>(at[a]) + 0.5);
         }
-    };
-    std::atomic<int> done{0};
-    trk::parallelFor(static_cast<size_t>(blocks * blocks), 1, [&](size_t i) {
-        const int column = static_cast<int>(i);
-        for (int k = 0; k < blocks; ++k) {
-            const openvdb::Coord origin(8 * (column / blocks), 8 * (column % blocks), 8 * k);
-            const Vec3d centre{
-                {(origin.x() + 4) * voxel, (origin.y() + 4) * voxel, (origin.z() + 4) * voxel}};
-            if (shape.emptyAround(centre, 7 * voxel)) {
-                continue;
-            }
-            auto leaf = std::make_unique<Leaf>(origin, openvdb::zeroVal<Value>());
-            fill(*leaf);
-            if (!leaf->isEmpty()) {
-                leaves[i * static_cast<size_t>(blocks) + static_cast<size_t>(k)] = std::move(leaf);
-            }
+        trk::Sample<Value> sample{};
+        bool any = false;
+        for (size_t c = 0; c < sample.size() && inside; ++c) {
+            const double d = shape.density(p, static_cast<int>(c));
+            sample[c] = d > kLeast ? static_cast<float>(d) : 0.0f;
+            any = any || d > kLeast;
         }
-        progress(static_cast<double>(++done) / (blocks * blocks));
-    });
-    auto grid = GridType::create();
-    for (auto& leaf : leaves) {
-        if (leaf) {
-            grid->tree().addLeaf(leaf.release());
+        if (any) {
+            values[i] = trk::fromFloats<Value>(sample.data());
+            leaf.mask[i >> 6] |= uint64_t{1} << (i & 63);
         }
     }
-    return grid;
+    if (leaf.mask != decltype(leaf.mask){}) {
+        trk::encodeLeaf(leaf, values.data(), buffer);
+    }
+}
+
+/// The shape's leaves, node of 16^3 after node, as a file has them: their values go to `buffers`,
+/// which is written and not committed, so that no more than one node is in memory.
+template <class Value>
+std::vector<trk::LeafPlace> makeLeaves(const Shape& shape, int voxels,
+                                       const trk::OutputFile& buffers,
+                                       const std::function<void(double)>& progress) {
+    constexpr int32_t kLeaf = 8;
+    constexpr int32_t kNode = 128;
+    constexpr size_t kPerNode = 16 * 16 * 16;
+    std::vector<trk::LeafPlace> all;
+    std::ofstream out(buffers.path(), std::ios::binary);
+    const auto nodes = static_cast<size_t>((voxels + kNode - 1) / kNode);
+    std::atomic<size_t> done{0};
+    for (size_t n = 0; n < nodes * nodes * nodes; ++n) {
+        std::vector<trk::LeafPlace> leaves(kPerNode);
+        std::vector<std::string> buffer(kPerNode);
+        trk::parallelFor(kPerNode, 4, [&](size_t i) {
+            const size_t node[3] = {n / (nodes * nodes), n / nodes % nodes, n % nodes};
+            const size_t leaf[3] = {i >> 8, i >> 4 & 15, i & 15};
+            bool inside = true;
+            for (size_t a = 0; a < 3; ++a) {
+                leaves[i].origin[a] =
+                    kNode * static_cast<int32_t>(node[a]) + kLeaf * static_cast<int32_t>(leaf[a]);
+                inside = inside && leaves[i].origin[a] < voxels;
+            }
+            if (inside) {
+                makeLeaf<Value>(shape, voxels, leaves[i], buffer[i]);
+            }
+            progress(static_cast<double>(++done) /
+                     static_cast<double>(nodes * nodes * nodes * kPerNode));
+        });
+        for (size_t i = 0; i < kPerNode; ++i) {
+            if (!buffer[i].empty()) {
+                all.push_back(leaves[i]);
+                out.write(buffer[i].data(), static_cast<std::streamsize>(buffer[i].size()));
+            }
+        }
+    }
+    out.close();
+    if (!out) {
+        throw trk::Error(TRK_ERROR_IO, buffers.target() + ": cannot be written: is the disk full?");
+    }
+    return all;
 }
 
 }  // namespace
@@ -332,21 +362,27 @@ ProceduralSummary writeProcedural(const ProceduralOptions& options, const trk::O
                                   const std::function<void(double)>& progress) {
     openvdb::initialize();
     const std::unique_ptr<Shape> shape = makeShape(options);
-    openvdb::GridBase::Ptr grid;
-    if (shape->coloured()) {
-        grid = makeGrid<openvdb::Vec3SGrid>(*shape, options.voxels, progress);
-    } else {
-        grid = makeGrid<openvdb::FloatGrid>(*shape, options.voxels, progress);
-    }
     ProceduralSummary summary;
     summary.voxelSize = kBoxSize / options.voxels;
-    summary.activeVoxels = grid->activeVoxelCount();
-    grid->setName("density");
-    grid->setGridClass(openvdb::GRID_FOG_VOLUME);
-    grid->setTransform(openvdb::math::Transform::createLinearTransform(summary.voxelSize));
-    trk::VdbWriter writer(file, 1);
-    writer.add(grid);
-    writer.finish();
+    const auto write = [&](const openvdb::GridBase::Ptr& grid, auto zero) {
+        using Value = decltype(zero);
+        // Of the file's own name, which it never gets.
+        const trk::OutputFile buffers(file.target(), true);
+        const trk::EncodedTree tree =
+            trk::encodeLeaves<Value>(makeLeaves<Value>(*shape, options.voxels, buffers, progress));
+        summary.activeVoxels = tree.activeVoxels;
+        grid->setName("density");
+        grid->setGridClass(openvdb::GRID_FOG_VOLUME);
+        grid->setTransform(openvdb::math::Transform::createLinearTransform(summary.voxelSize));
+        trk::VdbWriter writer(file, 1);
+        writer.add(grid, tree, buffers);
+        writer.finish();
+    };
+    if (shape->coloured()) {
+        write(openvdb::Vec3SGrid::create(), openvdb::Vec3f(0));
+    } else {
+        write(openvdb::FloatGrid::create(), 0.0f);
+    }
     return summary;
 }
 

@@ -41,11 +41,11 @@ class Voxels {
     /// `maxMemory`: what all may take, in bytes; 0: no limit.
     Voxels(trk::VdbTree<Value>& source, const Int3& anchor, uint64_t maxMemory)
         : source_(source), anchor_(anchor), pageLeaves_(source.leafCount()) {
-        // The lists of leaves, their boxes and the table take the other half.
+        // The lists of leaves, their boxes and the table take most of the rest.
         if (maxMemory > 0) {
             constexpr uint64_t kLeast = 64;
             pageLeaves_ = std::min<size_t>(
-                pageLeaves_, std::max(maxMemory / 2 / (kLeafVoxels * sizeof(Sample)), kLeast));
+                pageLeaves_, std::max(maxMemory / 4 / (kLeafVoxels * sizeof(Sample)), kLeast));
         }
         const bool all = pageLeaves_ == source.leafCount();
         leaves_.resize(all ? source.leafCount() * kLeafVoxels : 0);

@@ -72,6 +72,11 @@ class Baker {
         return std::move(baked_);
     }
 
+    BakeEstimate estimate() {
+        planSuperVoxels();
+        return {jobs_.size(), ownBytes()};
+    }
+
   private:
     using Entry = SparseTable::Entry;
 
@@ -120,14 +125,16 @@ class Baker {
     };
 
     /// Of the jobs' moments, and of all that may be made of them.
-    void checkMemory() const {
+    uint64_t ownBytes() const {
         constexpr uint64_t kFit = 250;  // of corners, a super-voxel
         const uint64_t fit = kind_ == ControlKind::kTrilinear ? kFit : 0;
         const uint64_t shape = (3 + shapeSize(kind_)) * sizeof(float);
         const uint64_t perChannel =
             sizeof(Moments) + sizeof(CornerMoments) + sizeof(BakedSuperVoxel) + shape + fit;
-        const uint64_t wanted = pages_.bytes() + 2 * plan_.bytes() +
-                                jobs_.size() * (sizeof(Int3) + channels_ * perChannel);
+        return 2 * plan_.bytes() + jobs_.size() * (sizeof(Int3) + channels_ * perChannel);
+    }
+    void checkMemory() const {
+        const uint64_t wanted = pages_.bytes() + ownBytes();
         if (options_.maxMemory > 0 && wanted > options_.maxMemory) {
             throw Error(TRK_ERROR_OUT_OF_MEMORY,
                         options_.where + ": baking " + std::to_string(jobs_.size()) +
@@ -467,6 +474,11 @@ BakedVolume bake(BrickPages pages, const BakeOptions& options) {
         addPreview(baked, pages, options.sidecarBytes);
     }
     return baked;
+}
+
+BakeEstimate estimateBake(const ExtinctionField& field, const BakeOptions& options) {
+    BrickPages pages(field);
+    return Baker(pages, options).estimate();
 }
 
 uint64_t sidecarLimit(uint64_t sourceBytes, ControlKind kind) {

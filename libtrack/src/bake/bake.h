@@ -31,6 +31,14 @@ struct BakeOptions {
 /// beyond maxMemory.
 BakedVolume bake(BrickPages pages, const BakeOptions& options);
 
+/// What a bake takes beside its density, in bytes, by the field's table alone, for so many
+/// super-voxels.
+struct BakeEstimate {
+    uint64_t superVoxels = 0;  ///< that are not alike
+    uint64_t bytes = 0;
+};
+BakeEstimate estimateBake(const ExtinctionField& field, const BakeOptions& options);
+
 /// How large a sidecar of a density of `sourceBytes` as a file may be, pictures included.
 uint64_t sidecarLimit(uint64_t sourceBytes, ControlKind kind);
 

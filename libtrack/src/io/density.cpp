@@ -122,11 +122,19 @@ Density fromSource(RegionSource<Value>& source, uint32_t repair, uint64_t maxMem
     return density;
 }
 
+template <class Value>
+uint64_t brickBytes(bool half) {
+    return ExtinctionField::kBrickVertices * ValueTraits<Value>::kChannels *
+           (half ? sizeof(uint16_t) : sizeof(float));
+}
+
+/// What a page takes at least: several super-voxels of 64^3.
+constexpr uint64_t kLeastPage = uint64_t{12} << 20;
+
 /// Whether the bricks of a tree, and a bake, may have no room.
 template <class Value>
 bool mayNotFit(const VdbTree<Value>& tree, uint64_t maxMemory) {
-    const uint64_t stored = tree.isHalf() ? sizeof(uint16_t) : sizeof(float);
-    const uint64_t brick = ExtinctionField::kBrickVertices * ValueTraits<Value>::kChannels * stored;
+    const uint64_t brick = brickBytes<Value>(tree.isHalf());
     // Those beside leaves, and what is made of them.
     return maxMemory > 0 && tree.leafCount() * brick / 2 * 3 + tree.listBytes() > maxMemory;
 }
@@ -155,8 +163,7 @@ Density fromTree(std::unique_ptr<VdbFile> file, const VdbEntry& entry,
                 std::move(file), std::move(tree), std::move(leaves), scan, density.summary.anchor);
             density.field = bricks->field();
             density.loader = std::move(bricks);
-            constexpr uint64_t kLeast = uint64_t{12} << 20;  // several super-voxels of 64^3
-            density.pageBytes = std::max(options.maxMemory / 4, kLeast);
+            density.pageBytes = std::max(options.maxMemory / 4, kLeastPage);
         }
     }
     density.summary.gridBytes = gridBytes;
@@ -209,6 +216,41 @@ Density loadDensity(const std::string& path, const DensityOptions& options) {
     density.summary.valueType = valueType;
     density.summary.indexToWorld = map;
     return density;
+}
+
+DensityEstimate estimateDensity(const std::string& path, const DensityOptions& options) {
+    VdbFile file(path);
+    const VdbEntry& entry = choose(file, options);
+    const std::string where = path + ": grid " + entry.label();
+    checkKind(entry.type, file.readHeader(entry).gridClass(), where);
+    DensityEstimate estimate;
+    withValueType(valueTypeName(entry.type), [&](auto zero) {
+        using Value = decltype(zero);
+        const VdbTree<Value> tree(file, entry, options.maxMemory);
+        checkLeafCount(tree, where);
+        RegionScan scan;
+        for (const auto& origin : tree.leafOrigins()) {
+            addSupport(origin, 8, scan);
+        }
+        for (const Tile<Value>& tile : tree.tiles()) {
+            scanTile(tile, scan);
+        }
+        LeafTraits<Value> varied;
+        varied.resize(tree.leafCount());
+        const Int3 anchor = anchorFor(scan.box);
+        BrickPlan<Value> plan(tree, varied, anchor, scan.localBox(anchor));
+        const uint64_t brick = brickBytes<Value>(tree.isHalf());
+        estimate.leaves = tree.leafCount();
+        estimate.tiles = tree.tiles().size();
+        estimate.bricks = plan.bricks().size();
+        estimate.heldBytes = estimate.bricks * brick + plan.table().bytes();
+        estimate.peakBytes =
+            estimate.bricks * brick + plan.bytes() + varied.bytes() + tree.listBytes();
+        estimate.loaderBytes = TreeBricks<Value>::bytesOf(tree, varied, plan) + kLeastPage;
+        estimate.field = {
+            ValueTraits<Value>::kChannels, std::move(plan.table()), plan.constants(), {}, {}};
+    });
+    return estimate;
 }
 
 Density makeDensity(const TrkDensity& given, uint32_t repair, uint64_t maxMemory) {

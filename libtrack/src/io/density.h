@@ -67,7 +67,21 @@ struct Density {
 /// velocities), else "density". Throws Error.
 Density loadDensity(const std::string& path, const DensityOptions& options);
 
-/// The same of a density in memory, whose numbers were found to be in range. Throws Error.
+/// What opening a grid and baking it will need, by its structure alone. Bricks are counted as if no
+/// leaf had any part of one value: there may be fewer.
+struct DensityEstimate {
+    uint64_t leaves = 0;
+    uint64_t tiles = 0;
+    uint64_t bricks = 0;       ///< at most
+    uint64_t heldBytes = 0;    ///< by the field; half of it where a file of floats has halfs alone
+    uint64_t peakBytes = 0;    ///< while it is loaded
+    uint64_t loaderBytes = 0;  ///< without bricks and with a page, at least
+    ExtinctionField field;     ///< of as many bricks, without them
+};
+/// Reads the grid's structure. Throws Error.
+DensityEstimate estimateDensity(const std::string& path, const DensityOptions& options);
+
+/// As loadDensity, of a density in memory, whose numbers were found to be in range.
 Density makeDensity(const TrkDensity& given, uint32_t repair, uint64_t maxMemory);
 
 }  // namespace trk

@@ -67,9 +67,11 @@ class TreeBricks : public BrickLoader {
         return {kChannels, std::move(plan_.table()), plan_.constants(), {}, {}};
     }
 
-    size_t bytes() const override {
-        return tree_->listBytes() + leaves_.bytes() + plan_.bytes() +
-               2 * brickOf_.size() * sizeof(uint32_t);
+    size_t bytes() const override { return bytesOf(*tree_, leaves_, plan_); }
+    static uint64_t bytesOf(const VdbTree<Value>& tree, const LeafTraits<Value>& leaves,
+                            const BrickPlan<Value>& plan) {
+        return tree.listBytes() + leaves.bytes() + plan.bytes() +
+               2 * plan.slots() * sizeof(uint32_t);
     }
     std::vector<Entry> bricks() const override {
         std::vector<Entry> all;

@@ -320,6 +320,98 @@ EncodedTree encodeTree(const TreeLayout& layout, const std::vector<Value>& value
     return tree;
 }
 
+template <class Value>
+void encodeLeaf(const LeafPlace& leaf, const Value* values, std::string& buffers) {
+    std::vector<Value> active;
+    for (size_t i = 0; i < 512; ++i) {
+        if ((leaf.mask[i >> 6] >> (i & 63) & 1) != 0) {
+            active.push_back(values[i]);
+        }
+    }
+    put(buffers, leaf.mask);
+    putValues(buffers, active);
+}
+
+template <class Value>
+EncodedTree encodeLeaves(const std::vector<LeafPlace>& leaves) {
+    using Tree = typename openvdb::tree::Tree4<Value, 5, 4, 3>::Type;
+    using Upper = typename Tree::RootNodeType::ChildNodeType;
+    EncodedTree tree;
+    const auto nodeOf = [](const LeafPlace& leaf, int shift) {
+        std::array<int32_t, 3> node = leaf.origin;
+        for (int32_t& x : node) {
+            x &= -(int32_t{1} << shift);
+        }
+        return node;
+    };
+    // A node's masks, its values, of which it has none, and what its children are.
+    const auto putNode = [](const std::vector<uint64_t>& children, const std::string& below,
+                            std::string& out) {
+        out.append(reinterpret_cast<const char*>(children.data()), 8 * children.size());
+        out.append(8 * children.size(), '\0');
+        putValues(out, std::vector<Value>());
+        out += below;
+    };
+    const auto forEachNode = [&](size_t begin, size_t end, int shift, const auto& body) {
+        for (size_t first = begin; first < end;) {
+            size_t last = first;
+            while (last < end && nodeOf(leaves[last], shift) == nodeOf(leaves[first], shift)) {
+                ++last;
+            }
+            body(first, last);
+            first = last;
+        }
+    };
+    const auto mark = [](std::vector<uint64_t>& children, uint64_t slot) {
+        children[slot >> 6] |= uint64_t{1} << (slot & 63);
+    };
+    uint32_t roots = 0;
+    std::string below;
+    forEachNode(0, leaves.size(), 12, [&](size_t rootBegin, size_t rootEnd) {
+        ++roots;
+        put(below, nodeOf(leaves[rootBegin], 12));
+        std::vector<uint64_t> lowers(512);
+        std::string lowerBytes;
+        forEachNode(rootBegin, rootEnd, 7, [&](size_t begin, size_t end) {
+            std::vector<uint64_t> mask(64);
+            std::string leafBytes;
+            for (size_t i = begin; i < end; ++i) {
+                const LeafPlace& leaf = leaves[i];
+                const Int3 at{{leaf.origin[0], leaf.origin[1], leaf.origin[2]}};
+                mark(mask, slot(at, 3, 4));
+                put(leafBytes, leaf.mask);
+                const openvdb::Coord origin(leaf.origin[0], leaf.origin[1], leaf.origin[2]);
+                for (uint32_t v = 0; v < 512; ++v) {
+                    if ((leaf.mask[v >> 6] >> (v & 63) & 1) != 0) {
+                        tree.box.expand(origin.offsetBy(static_cast<int>(v >> 6),
+                                                        static_cast<int>(v >> 3 & 7),
+                                                        static_cast<int>(v & 7)));
+                        ++tree.activeVoxels;
+                    }
+                }
+            }
+            const auto lower = nodeOf(leaves[begin], 7);
+            mark(lowers, slot({{lower[0], lower[1], lower[2]}}, 7, 5));
+            putNode(mask, leafBytes, lowerBytes);
+            tree.openvdbBytes += sizeof(typename Upper::ChildNodeType);
+        });
+        putNode(lowers, lowerBytes, below);
+        tree.openvdbBytes += sizeof(Upper);
+    });
+    tree.openvdbBytes += leaves.size() * (512 * sizeof(Value) + 96);
+    put(tree.topology, int32_t{1});  // buffers
+    put(tree.topology, Value{});     // background
+    put(tree.topology, uint32_t{0});
+    put(tree.topology, roots);
+    tree.topology += below;
+    return tree;
+}
+
+template EncodedTree encodeLeaves<float>(const std::vector<LeafPlace>&);
+template EncodedTree encodeLeaves<openvdb::Vec3f>(const std::vector<LeafPlace>&);
+template void encodeLeaf(const LeafPlace&, const float*, std::string&);
+template void encodeLeaf(const LeafPlace&, const openvdb::Vec3f*, std::string&);
+
 template EncodedTree encodeTree(const TreeLayout&, const std::vector<float>&);
 template EncodedTree encodeTree(const TreeLayout&, const std::vector<double>&);
 template EncodedTree encodeTree(const TreeLayout&, const std::vector<openvdb::Vec3f>&);

@@ -6,6 +6,7 @@
 #include "../sparse_table.h"
 #include "openvdb_grids.h"
 
+#include <array>
 #include <cstdint>
 #include <string>
 #include <vector>
@@ -50,6 +51,21 @@ struct EncodedTree {
 /// what is alike is a tile. `values`: of the table's items, by SparseTable::index of their entry.
 template <class Value>
 EncodedTree encodeTree(const TreeLayout& layout, const std::vector<Value>& values);
+
+/// A leaf of 8^3 values whose mask says which are active; the others are 0.
+struct LeafPlace {
+    std::array<int32_t, 3> origin;
+    std::array<uint64_t, 8> mask;
+};
+
+/// The same of a tree of leaves alone, given in the order of their nodes. Its buffers are empty:
+/// whoever has the values makes them, one leaf after another, by encodeLeaf.
+template <class Value>
+EncodedTree encodeLeaves(const std::vector<LeafPlace>& leaves);
+
+/// Appends a leaf's buffer. `values`: all 8^3, x slowest.
+template <class Value>
+void encodeLeaf(const LeafPlace& leaf, const Value* values, std::string& buffers);
 
 /// The compression of an encoded tree, OpenVDB's COMPRESS_… bits.
 constexpr uint32_t kEncodedCompression = 6;

@@ -33,7 +33,10 @@ class VdbWriter::Archive : public openvdb::io::Archive {
         writeGrid(descriptor, grid, stream_, /*seekable=*/true);
         openvdb::io::setDataCompression(stream_, compression());
     }
-    void add(const openvdb::GridBase::Ptr& grid, const EncodedTree& tree) {
+    /// `writeBuffers(stream)` writes those that `tree` does not hold.
+    template <class WriteBuffers>
+    void add(const openvdb::GridBase::Ptr& grid, const EncodedTree& tree,
+             const WriteBuffers& writeBuffers) {
         openvdb::io::GridDescriptor descriptor(grid->getName(), grid->type());
         descriptor.writeHeader(stream_);
         const auto offsets = stream_.tellp();
@@ -59,6 +62,7 @@ class VdbWriter::Archive : public openvdb::io::Archive {
         write(tree.topology);
         descriptor.setBlockPos(stream_.tellp());
         write(tree.buffers);
+        writeBuffers(stream_);
         descriptor.setEndPos(stream_.tellp());
         stream_.seekp(offsets);
         descriptor.writeStreamPos(stream_);
@@ -98,7 +102,19 @@ void VdbWriter::add(const openvdb::GridBase::Ptr& grid) {
 }
 
 void VdbWriter::add(const openvdb::GridBase::Ptr& grid, const EncodedTree& tree) {
-    writing([&] { archive_->add(grid, tree); });
+    writing([&] { archive_->add(grid, tree, [](std::ostream&) {}); });
+}
+
+void VdbWriter::add(const openvdb::GridBase::Ptr& grid, const EncodedTree& tree,
+                    const OutputFile& buffers) {
+    writing([&] {
+        std::ifstream from(buffers.path(), std::ios::binary);
+        archive_->add(grid, tree, [&](std::ostream& to) {
+            if (from.peek() != std::ifstream::traits_type::eof()) {
+                to << from.rdbuf();
+            }
+        });
+    });
 }
 
 void VdbWriter::finish() {

@@ -24,6 +24,9 @@ class VdbWriter {
     void add(const openvdb::GridBase::Ptr& grid);
     /// A grid whose tree was encoded; `grid` has none, and gets metadata that tells of this one.
     void add(const openvdb::GridBase::Ptr& grid, const EncodedTree& tree);
+    /// The same, where the tree's buffers are in a file of their own.
+    void add(const openvdb::GridBase::Ptr& grid, const EncodedTree& tree,
+             const OutputFile& buffers);
     /// To be called after the last grid: what was written may still wait in buffers.
     void finish();
 

@@ -50,6 +50,7 @@ class BrickPages {
         : field_(field), loader_(&loader), mostSlots_(pageBytes / brickBytes()) {}
 
     const ExtinctionField& field() const { return field_; }
+    bool resident() const { return !loader_; }
     /// Memory of all there is, and of a page.
     uint64_t bytes() const {
         return field_.bytes() + (loader_ ? loader_->bytes() + mostSlots_ * brickBytes() : 0);
@@ -83,6 +84,10 @@ class BrickPages {
                     }
                 });
             } while (end < count && loader_->slots() < mostSlots_);
+            const auto share = [&](size_t i) {
+                return static_cast<double>(i) / static_cast<double>(count);
+            };
+            const Progress::Stage stage(share(begin), share(end));
             loader_->load(page_);
             parallelFor(end - begin, grain, [&](size_t i) { body(begin + i); });
             begin = end;

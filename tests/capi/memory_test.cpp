@@ -177,7 +177,7 @@ struct Dense {
     float at(int x, int y, int z) const { return grid->tree().getValue(origin + Coord(x, y, z)); }
     TrkDensity density() const {
         TrkDensity d = trkDefaultDensity();
-        for (int a = 0; a < 3; ++a) {
+        for (unsigned a = 0; a < 3; ++a) {
             d.origin[a] = origin[a];
             d.extent[a] = static_cast<uint64_t>(n);
         }

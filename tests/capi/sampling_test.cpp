@@ -385,8 +385,8 @@ void expectInterpolated(const std::string& name, const typename GridType::Ptr& g
             for (int corner = 0; corner < 8; ++corner) {
                 double weight = 1.5 * static_cast<double>(color[c]);
                 openvdb::Coord at = cell;
-                for (int a = 0; a < 3; ++a) {
-                    const double f = index[a] - cell[a];
+                for (unsigned a = 0; a < 3; ++a) {
+                    const double f = index[static_cast<int>(a)] - cell[a];
                     const bool upper = (corner >> a & 1) != 0;
                     weight *= upper ? f : 1 - f;
                     at[a] += upper ? 1 : 0;

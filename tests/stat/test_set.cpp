@@ -157,14 +157,14 @@ Scene::Scene(const Medium& medium, int size, const Way& chosen, double meanDepth
     rays = prepare(volume, count);
 }
 
-std::array<double, 3> Scene::exactDepthOf(const trk::Volume& volume, const PreparedRay& ray) {
+std::array<double, 3> Scene::exactDepthOf(const trk::Volume& of, const PreparedRay& ray) {
     std::array<double, 3> result{};
-    trk::withVariant(volume, ControlKind::kConstant, [&](auto variant) {
+    trk::withVariant(of, ControlKind::kConstant, [&](auto variant) {
         using V = decltype(variant);
         trk::PathCost cost;
-        const auto depth = trk::exactOpticalDepth(typename V::Extinction(volume), ray.local,
-                                                  ray.lengthPerVoxel, cost);
-        std::copy(depth.begin(), depth.end(), result.begin());
+        const auto exact =
+            trk::exactOpticalDepth(typename V::Extinction(of), ray.local, ray.lengthPerVoxel, cost);
+        std::copy(exact.begin(), exact.end(), result.begin());
     });
     return result;
 }

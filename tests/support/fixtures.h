@@ -16,11 +16,15 @@
 namespace fixtures {
 
 /// Whether a sanitizer slows this build down and takes memory of its own.
-inline constexpr bool kSanitized =
-#if defined(__SANITIZE_ADDRESS__) || defined(__SANITIZE_THREAD__)
-    true;
+#if defined(__has_feature)  // clang
+#if __has_feature(address_sanitizer)
+#define TRACK_SANITIZED 1
+#endif
+#endif
+#if defined(__SANITIZE_ADDRESS__) || defined(TRACK_SANITIZED)
+inline constexpr bool kSanitized = true;
 #else
-    false;
+inline constexpr bool kSanitized = false;
 #endif
 
 /// A file name in this process's own temporary folder, which is removed at exit.

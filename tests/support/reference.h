@@ -75,8 +75,8 @@ class Field {
         r.t0 = ray.tMin;
         r.t1 = ray.tMax;
         for (int a = 0; a < 3; ++a) {
-            const double lo = box_.min()[a] - 1.0;
-            const double hi = box_.max()[a] + 1.0;
+            const double lo = box_.min()[static_cast<unsigned>(a)] - 1.0;
+            const double hi = box_.max()[static_cast<unsigned>(a)] + 1.0;
             if (r.direction[a] == 0) {
                 if (r.origin[a] < lo || r.origin[a] > hi) {
                     r.t1 = -std::numeric_limits<double>::infinity();
@@ -98,8 +98,8 @@ class Field {
         for (int corner = 0; corner < 8; ++corner) {
             double weight = 1;
             openvdb::Coord at = cell;
-            for (int a = 0; a < 3; ++a) {
-                const double f = p[a] - cell[a];
+            for (unsigned a = 0; a < 3; ++a) {
+                const double f = p[static_cast<int>(a)] - cell[a];
                 const bool upper = (corner >> a & 1) != 0;
                 weight *= upper ? f : 1 - f;
                 at[a] += upper ? 1 : 0;

@@ -308,7 +308,7 @@ TEST(Sidecar, OfASmallVolumeIsSmallWhereverThatLies) {
         for (size_t a = 0; a < 3; ++a) {
             const int axis = static_cast<int>(a);
             EXPECT_NEAR(alone.header.indexToWorld.translation[axis], 0, 2e-6) << offset;
-            EXPECT_LE(alone.header.origin[a], offset[axis] - 1);
+            EXPECT_LE(alone.header.origin[a], offset[static_cast<unsigned>(a)] - 1);
         }
     }
 }

@@ -171,6 +171,26 @@ TEST(SparseVolumes, EqualTilesAreOne) {
     EXPECT_LT(report.vertices, 1000000u);
 }
 
+// Of what lies between two tiles there are three faces, three edges and a corner a tile, and as
+// much again where the outermost tiles end.
+TEST(SparseVolumes, DifferentTilesCostTheirSidesOnce) {
+    openvdb::initialize();
+    auto grid = openvdb::FloatGrid::create();
+    grid->setName("density");
+    const int edge = 4;
+    const int tiles = edge * edge * edge;
+    for (int i = 0; i < tiles; ++i) {
+        grid->tree().addTile(
+            2, openvdb::Coord(128 * (i / (edge * edge)), 128 * (i / edge % edge), 128 * (i % edge)),
+            0.01f * static_cast<float>(i + 1), true);
+    }
+    const trk::Density density = fixtures::load(fixtures::write("differenttiles.vdb", {grid}));
+    const int sides = (edge + 1) * (edge + 1) * (edge + 1) * 8;
+    EXPECT_LT(density.field.brickCount(), static_cast<size_t>(sides));
+    EXPECT_LT(trk::estimateBake(density.field, fixtures::bakeOptions(16, 4)).superVoxels,
+              static_cast<uint64_t>(sides));
+}
+
 TEST(SparseVolumes, ALargeTileIsProvedToo) {
     openvdb::initialize();
     auto grid = openvdb::FloatGrid::create();

@@ -90,7 +90,7 @@ Volume makeVolume(const Grid& grid, const TrkVolumeOptions& options = trkDefault
     std::vector<const void*> brickValues;
     std::vector<uint64_t> brickMasks;
     for (auto leaf = tree.cbeginLeaf(); leaf; ++leaf) {
-        for (int a = 0; a < 3; ++a) {
+        for (openvdb::Index a = 0; a < 3; ++a) {
             brickOrigins.push_back(leaf->origin()[a]);
         }
         brickValues.push_back(leaf->buffer().data());
@@ -110,7 +110,7 @@ Volume makeVolume(const Grid& grid, const TrkVolumeOptions& options = trkDefault
         }
         openvdb::CoordBBox box;
         tile.getBoundingBox(box);
-        for (int a = 0; a < 3; ++a) {
+        for (openvdb::Index a = 0; a < 3; ++a) {
             tileOrigins.push_back(box.min()[a]);
         }
         tileSizes.push_back(box.dim()[0]);

@@ -110,10 +110,11 @@ class Baker {
                 return known;
             },
             [&](const Int3& origin) { return addJob(origin) | single; },
-            // The surface of a large tile repeats a handful of patterns of bricks. Nodes alone are
-            // looked for: of a lone super-voxel that costs more than to bake it.
+            // The surface of a large tile repeats a handful of patterns of bricks. Of a lone small
+            // super-voxel, to look for it costs more than to bake it.
             [&](const Int3& origin, int shift, SparseTable::Key& key) {
-                return shift > shift_ && field_.table().appendKey(origin, shift, key);
+                return (shift > shift_ || shift > ExtinctionField::kBrickShift) &&
+                       field_.table().appendKey(origin, shift, key);
             });
     }
 

@@ -27,51 +27,65 @@ LocalRay lineThrough(const IntBox& box, const Vec3d& place, int axis) {
     return ray;
 }
 
-/// What of a line lies in a region of one entry, and the integral of the density there (the mean
-/// over channels).
+/// What of a line lies in a region of one entry.
 struct Piece {
     SparseTable::Entry entry;
     uint32_t line;
     Int3 lo;
     double t0;
     double t1;
-    double depth;
 };
 
-/// Integrals of the density along lines, in voxel lengths.
+/// The integral of the density over it (the mean over channels), in voxel lengths.
+double depthOf(const BrickPages& pages, const Piece& piece, const LocalRay& line) {
+    const auto depth = [&](auto channels) {
+        double sum = 0;
+        for (const double d :
+             pages.integrate<channels>(piece.entry, piece.lo, line, piece.t0, piece.t1)) {
+            sum += d / static_cast<double>(channels);
+        }
+        return sum;
+    };
+    return pages.field().channels() == 1 ? depth(std::integral_constant<size_t, 1>{})
+                                         : depth(std::integral_constant<size_t, 3>{});
+}
+
+/// Integrals along whole lines. With pages, piece after piece in the order of their bricks; they
+/// are summed in the order of the lines either way.
 std::vector<double> depthsAlong(BrickPages& pages, const std::vector<LocalRay>& lines) {
-    std::vector<Piece> pieces;
-    for (size_t i = 0; i < lines.size(); ++i) {
+    const auto forEachPiece = [&](size_t i, const auto& body) {
         pages.field().table().walk(
             lines[i], 0, lines[i].tEnd,
             [&](SparseTable::Entry entry, const Int3& lo, int, double t0, double t1) {
-                pieces.push_back({entry, static_cast<uint32_t>(i), lo, t0, t1, 0});
+                body(Piece{entry, static_cast<uint32_t>(i), lo, t0, t1});
                 return true;
             });
+    };
+    std::vector<double> depths(lines.size(), 0);
+    if (pages.resident()) {
+        parallelFor(lines.size(), 16, [&](size_t i) {
+            forEachPiece(i,
+                         [&](const Piece& piece) { depths[i] += depthOf(pages, piece, lines[i]); });
+        });
+        return depths;
     }
-    std::vector<uint32_t> order(pieces.size());  // a brick's pieces side by side
+    std::vector<Piece> pieces;
+    for (size_t i = 0; i < lines.size(); ++i) {
+        forEachPiece(i, [&](const Piece& piece) { pieces.push_back(piece); });
+    }
+    std::vector<uint32_t> order(pieces.size());
     std::iota(order.begin(), order.end(), 0u);
     std::sort(order.begin(), order.end(), [&](uint32_t a, uint32_t b) {
         return std::tie(pieces[a].entry, a) < std::tie(pieces[b].entry, b);
     });
+    std::vector<double> parts(pieces.size());
     const auto bricksOf = [&](size_t i, const auto& f) { f(pieces[order[i]].entry); };
     pages.forEach(pieces.size(), 64, bricksOf, [&](size_t i) {
-        Piece& piece = pieces[order[i]];
-        const LocalRay& line = lines[piece.line];
-        const auto depth = [&](auto channels) {
-            double sum = 0;
-            for (const double d :
-                 pages.integrate<channels>(piece.entry, piece.lo, line, piece.t0, piece.t1)) {
-                sum += d / static_cast<double>(channels);
-            }
-            return sum;
-        };
-        piece.depth = pages.field().channels() == 1 ? depth(std::integral_constant<size_t, 1>{})
-                                                    : depth(std::integral_constant<size_t, 3>{});
+        const Piece& piece = pieces[order[i]];
+        parts[order[i]] = depthOf(pages, piece, lines[piece.line]);
     });
-    std::vector<double> depths(lines.size(), 0);
-    for (const Piece& piece : pieces) {
-        depths[piece.line] += piece.depth;
+    for (size_t i = 0; i < pieces.size(); ++i) {
+        depths[pieces[i].line] += parts[i];
     }
     return depths;
 }
@@ -89,7 +103,7 @@ double twoDigits(double value) {
 
 double previewScale(BrickPages pages, const AffineMap& indexToWorld) {
     const ExtinctionField& field = pages.field();
-    constexpr size_t kPlaces = 1024;
+    constexpr size_t kPlaces = 256;
     size_t count = 0;
     field.table().forEach([&](const Int3&, int, SparseTable::Entry) { ++count; });
     const size_t step = std::max<size_t>(1, count / kPlaces);

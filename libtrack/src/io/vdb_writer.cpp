@@ -59,9 +59,9 @@ class VdbWriter::Archive : public openvdb::io::Archive {
                          openvdb::StringMetadata(openvdb::io::compressionToString(compression)));
         grid->writeMeta(stream_);
         grid->writeTransform(stream_);
-        write(tree.topology);
+        put(tree.topology);
         descriptor.setBlockPos(stream_.tellp());
-        write(tree.buffers);
+        put(tree.buffers);
         writeBuffers(stream_);
         descriptor.setEndPos(stream_.tellp());
         stream_.seekp(offsets);
@@ -71,7 +71,7 @@ class VdbWriter::Archive : public openvdb::io::Archive {
     void finish() { stream_.close(); }
 
   private:
-    void write(const std::string& bytes) {
+    void put(const std::string& bytes) {
         stream_.write(bytes.data(), static_cast<std::streamsize>(bytes.size()));
     }
 

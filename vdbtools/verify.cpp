@@ -128,21 +128,12 @@ class Voxels {
     /// Calls f(leaf) for the leaves that have voxels in a closed box of `edge` cells.
     template <class F>
     void forEachLeaf(const Int3& origin, int64_t edge, const F& f) const {
-        Int3 lo;
-        for (size_t a = 0; a < 3; ++a) {
-            lo[a] = origin[a] - anchor_[a];
-        }
-        Int3 p;
-        for (p[0] = lo[0] & ~int64_t{7}; p[0] <= lo[0] + edge; p[0] += 8) {
-            for (p[1] = lo[1] & ~int64_t{7}; p[1] <= lo[1] + edge; p[1] += 8) {
-                for (p[2] = lo[2] & ~int64_t{7}; p[2] <= lo[2] + edge; p[2] += 8) {
-                    const auto entry = table_.find(p[0], p[1], p[2]).entry;
-                    if (!isConstant(entry)) {
-                        f(entry - 1);
-                    }
-                }
+        forEachBlock(origin, edge, [&](SparseTable::Entry entry) {
+            if (!isConstant(entry)) {
+                f(entry - 1);
             }
-        }
+            return true;
+        });
     }
 
     /// The value of a voxel, whose leaf is at hand.
@@ -170,30 +161,40 @@ class Voxels {
     /// Appends what the voxels of a closed box of `edge` cells follow from; false where leaves have
     /// a part in it.
     bool appendKey(const Int3& origin, int64_t edge, SparseTable::Key& key) const {
-        Int3 lo;
         for (size_t a = 0; a < 3; ++a) {
-            lo[a] = origin[a] - anchor_[a];
-            key.push_back(static_cast<SparseTable::Entry>(lo[a] & 7));
+            key.push_back(static_cast<SparseTable::Entry>((origin[a] - anchor_[a]) & 7));
         }
-        Int3 p;
-        for (p[0] = lo[0] & ~int64_t{7}; p[0] <= lo[0] + edge; p[0] += 8) {
-            for (p[1] = lo[1] & ~int64_t{7}; p[1] <= lo[1] + edge; p[1] += 8) {
-                for (p[2] = lo[2] & ~int64_t{7}; p[2] <= lo[2] + edge; p[2] += 8) {
-                    const auto entry = table_.find(p[0], p[1], p[2]).entry;
-                    if (!isConstant(entry)) {
-                        return false;
-                    }
-                    key.push_back(entry);
-                }
-            }
-        }
-        return true;
+        return forEachBlock(origin, edge, [&](SparseTable::Entry entry) {
+            key.push_back(entry);
+            return isConstant(entry);
+        });
     }
 
   private:
     static constexpr size_t kLeafVoxels = trk::LeafBatch<Value>::kLeafVoxels;
     static constexpr SparseTable::Entry kConstantFlag = 0x40000000u;
     static constexpr uint32_t kNowhere = 0xffffffffu;
+
+    /// Calls f(entry) for the aligned blocks of 8^3 voxels that have a part in a closed box of
+    /// `edge` cells, until it answers false; whether it never did.
+    template <class F>
+    bool forEachBlock(const Int3& origin, int64_t edge, const F& f) const {
+        Int3 lo;
+        for (size_t a = 0; a < 3; ++a) {
+            lo[a] = origin[a] - anchor_[a];
+        }
+        Int3 p;
+        for (p[0] = lo[0] & ~int64_t{7}; p[0] <= lo[0] + edge; p[0] += 8) {
+            for (p[1] = lo[1] & ~int64_t{7}; p[1] <= lo[1] + edge; p[1] += 8) {
+                for (p[2] = lo[2] & ~int64_t{7}; p[2] <= lo[2] + edge; p[2] += 8) {
+                    if (!f(table_.find(p[0], p[1], p[2]).entry)) {
+                        return false;
+                    }
+                }
+            }
+        }
+        return true;
+    }
 
     void take(const trk::LeafBatch<Value>& batch) {
         for (size_t i = 0; i < batch.count; ++i) {

@@ -373,6 +373,9 @@ void run(const Command& command, const std::vector<std::string>& given) {
     const Wanted wanted{arguments.flag("values"), arguments.flag("estimate")};
     Json json;
     if (trk::isSidecar(path)) {
+        if (wanted.estimate) {
+            throw UsageError("--estimate is of a density, and " + path + " is a sidecar");
+        }
         json = describeSidecar(path, wanted.values);
     } else {
         trk::VdbFile file(path);

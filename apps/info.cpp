@@ -95,8 +95,9 @@ Json estimateOf(const std::string& path, const trk::VdbEntry& entry) {
     json["open_bytes"] = estimate.heldBytes;
     json["open_peak_bytes"] = estimate.peakBytes;
     json["super_voxels"] = bake.superVoxels;
-    json["bake_bytes"] = std::max(estimate.peakBytes, estimate.heldBytes + bake.bytes);
-    json["least_bake_bytes"] = estimate.loaderBytes + bake.bytes;
+    const uint64_t inMemory = std::max(estimate.peakBytes, estimate.heldBytes + bake.bytes);
+    json["bake_bytes"] = inMemory;
+    json["least_bake_bytes"] = std::min(inMemory, estimate.loaderBytes + bake.bytes);
     return json;
 }
 
@@ -320,9 +321,11 @@ void printGrid(const Json& grid) {
                                   " tiles; at most " + e["bricks"].dump() + " bricks");
         printRow("to open", "at most " + byteCount(e["open_bytes"]) + ", " +
                                 byteCount(e["open_peak_bytes"]) + " meanwhile");
-        printRow("to bake", "at most " + byteCount(e["bake_bytes"]) +
-                                ", or more slowly with --max-memory of " +
-                                byteCount(e["least_bake_bytes"]) + " and more (" +
+        const std::string paged = e["least_bake_bytes"] == e["bake_bytes"]
+                                      ? ""
+                                      : ", or more slowly with --max-memory of " +
+                                            byteCount(e["least_bake_bytes"]) + " and more";
+        printRow("to bake", "at most " + byteCount(e["bake_bytes"]) + paged + " (" +
                                 e["super_voxels"].dump() + " super-voxels of 16^3, constant)");
     }
     printRow("bake", grid["can_be_baked"].is_null() ? "yes, if its values are fit"

@@ -136,6 +136,9 @@ case_main_job() {
     expect 0 info cloud.vdb --values
     contains stdout "bake          yes"
     contains stdout "bounds"
+    expect 0 info cloud.vdb --estimate
+    contains stdout "to bake       at most "
+    expect 2 info cloud.track.vdb --estimate
     expect 0 info cloud.track.vdb
     contains stdout "16^3 voxels"
     contains stdout "format        2.0"
@@ -627,6 +630,8 @@ case_json() {
     contains stdout '"active_voxels"'
     contains stdout '"can_be_baked": true'
     contains stdout '"bounds_min"'
+    expect 0 info cloud.vdb --json --estimate
+    contains stdout '"least_bake_bytes"'
     expect 0 info cloud.track.vdb --json
     contains stdout '"super_voxel_size": 8'
     contains stdout '"source_digest"'

@@ -1,18 +1,22 @@
 // SPDX-License-Identifier: Apache-2.0
 // What opening and baking cost over OpenVDB's reading of the same file, as a Markdown table: of the
-// files named as arguments, or of procedural volumes of about 17, 7 and 0.2 million voxels. All in
-// one run, interleaved, medians of several rounds of wall time; files lie in the system's cache.
+// files named as arguments, or of procedural volumes of about 17, 7 and 0.2 million voxels; then
+// what a dense array in memory costs over bricks of a tree. All in one run, interleaved, medians of
+// several rounds of wall time; files lie in the system's cache.
 #include "bake/bake.h"
 #include "support/fixtures.h"
 #include "track/track.hpp"
+#include "track/track_openvdb.hpp"
 
 #include <malloc.h>
 #include <openvdb/io/File.h>
+#include <openvdb/tools/Dense.h>
 #include <sys/wait.h>
 #include <unistd.h>
 
 #include <algorithm>
 #include <chrono>
+#include <cmath>
 #include <cstdio>
 #include <filesystem>
 #include <fstream>
@@ -36,6 +40,17 @@ void readWithOpenVdb(const std::string& path) {
     if (grid->activeVoxelCount() == 0) {
         std::printf("%s is empty\n", path.c_str());
     }
+}
+
+/// All that `vdbtrack bake` does.
+void bakeWhole(const std::string& file, int size, trk::ControlKind kind) {
+    const trk::Density density = fixtures::load(file);
+    trk::BakeOptions options = fixtures::bakeOptions(size, 4, kind);
+    options.sidecarBytes = trk::sidecarLimit(density.summary.fileBytes, kind);
+    trk::BakedVolume baked = trk::bake(density.field, options);
+    trk::OutputFile sidecar(fixtures::path("open_table.track.vdb"), true);
+    trk::writeBake(sidecar, density.summary, density.field, baked, options.sidecarBytes);
+    sidecar.commit();
 }
 
 /// Memory of this process in MB: "VmRSS" now, or "VmHWM" at most.
@@ -69,6 +84,46 @@ void printMemory(const std::string& path, const std::string& small) {
                 1e6 * peak / static_cast<double>(volume.info().bytes), after, trimmed);
 }
 
+/// Medians of several rounds, in which the ways take turns.
+std::vector<double> medians(const std::vector<std::function<void()>>& ways) {
+    constexpr size_t kRounds = 9;
+    std::vector<std::vector<double>> times(ways.size());
+    for (size_t round = 0; round < kRounds; ++round) {
+        for (size_t w = 0; w < ways.size(); ++w) {
+            times[w].push_back(seconds(ways[w]));
+        }
+    }
+    std::vector<double> result;
+    for (std::vector<double>& way : times) {
+        std::sort(way.begin(), way.end());
+        result.push_back(way[kRounds / 2]);
+    }
+    return result;
+}
+
+/// A dense array of 256^3, x fastest, to a volume with a control, over bricks of the same voxels'
+/// tree.
+void printDense(const char* name, const openvdb::FloatGrid& grid) {
+    constexpr int kEdge = 256;
+    const openvdb::Coord origin = grid.evalActiveVoxelBoundingBox().min();
+    openvdb::tools::Dense<float, openvdb::tools::LayoutXYZ> dense(
+        openvdb::CoordBBox::createCube(origin, kEdge));
+    openvdb::tools::copyToDense(grid, dense);
+    TrkDensity density = trkDefaultDensity();
+    density.values = dense.data();
+    for (int a = 0; a < 3; ++a) {
+        density.origin[a] = origin[a];
+        density.extent[a] = kEdge;
+    }
+    TrkVolumeOptions noBake = trkDefaultVolumeOptions();
+    noBake.noBake = 1;
+    const std::vector<double> times = medians({[&] { track::makeVolume(grid, noBake); },
+                                               [&] { track::Volume::make(density, noBake); },
+                                               [&] { track::Volume::make(density); }});
+    std::printf("| %s | %.4f | %.2f | %.2f |\n", name, times[0], times[1] / times[0],
+                times[2] / times[0]);
+}
+
 }  // namespace
 
 int main(int argc, char** argv) {
@@ -89,31 +144,17 @@ int main(int argc, char** argv) {
         "baked 4 affine | holds, MB | "
         "peak | resident | trimmed |\n|---|---|---|---|---|---|---|---|---|---|\n");
     for (const std::string& file : files) {
-        const std::string sidecar = fixtures::path("open_table.track.vdb");
-        const std::function<void()> ways[] = {
+        const std::vector<double> times = medians({
             [&] { readWithOpenVdb(file); },
             [&] { track::Volume::open(file, "", noBake); },
             [&] { track::Volume::open(file, ""); },
-            [&] { fixtures::bake(file, sidecar, 16, 4); },
-            [&] { fixtures::bake(file, sidecar, 4, 4, trk::ControlKind::kAffine); },
-        };
-        constexpr size_t kWays = 5;
-        constexpr size_t kRounds = 9;
-        std::vector<double> times[kWays];
-        for (size_t round = 0; round < kRounds; ++round) {
-            for (size_t w = 0; w < kWays; ++w) {
-                times[w].push_back(seconds(ways[w]));
-            }
+            [&] { bakeWhole(file, 16, trk::ControlKind::kConstant); },
+            [&] { bakeWhole(file, 4, trk::ControlKind::kAffine); },
+        });
+        std::printf("| %s | %.4f |", std::filesystem::path(file).filename().c_str(), times[0]);
+        for (size_t w = 1; w < times.size(); ++w) {
+            std::printf(" %.2f |", times[w] / times[0]);
         }
-        const auto median = [&](size_t w) {
-            std::sort(times[w].begin(), times[w].end());
-            return times[w][kRounds / 2];
-        };
-        const double reference = median(0);
-        std::printf("| %s | %.4f | %.2f | %.2f | %.2f | %.2f |",
-                    std::filesystem::path(file).filename().c_str(), reference,
-                    median(1) / reference, median(2) / reference, median(3) / reference,
-                    median(4) / reference);
         std::fflush(stdout);
         const pid_t child = fork();
         if (child == 0) {  // a heap of its own
@@ -123,5 +164,17 @@ int main(int argc, char** argv) {
         }
         waitpid(child, nullptr, 0);
     }
+    std::printf(
+        "\n| of 256^3 in memory | bricks of a tree, s | dense array | dense array, baked |\n"
+        "|---|---|---|---|\n");
+    openvdb::io::File file(fixtures::cloudFile(256));
+    file.open(/*delayLoad=*/false);
+    printDense("a cloud", *openvdb::gridPtrCast<openvdb::FloatGrid>(
+                              file.readGrid(file.beginName().gridName())));
+    printDense("density everywhere",
+               *fixtures::makeGrid(
+                   openvdb::CoordBBox::createCube({0, 0, 0}, 256), [](const openvdb::Coord& p) {
+                       return 2 + std::sin(0.1f * static_cast<float>(p.x() + p.y() * p.z()));
+                   }));
     return 0;
 }

@@ -13,6 +13,7 @@
 #include <cmath>
 #include <cstring>
 #include <limits>
+#include <utility>
 #include <vector>
 
 namespace trk {
@@ -118,13 +119,15 @@ class DenseSource : public RegionSource<Value> {
         return static_cast<const char*>(density_.values) + offset;
     }
 
+    /// The axis of x and z along which voxels lie closer.
+    size_t innerAxis() const { return std::abs(strides_[0]) < std::abs(strides_[2]) ? 0 : 2; }
+
     /// Calls f(voxel in the leaf, where its first component lies) for what the array covers, along
-    /// the array's own rows, until f answers false; whether it never did.
+    /// the array's own rows.
     template <class F>
-    bool forEachVoxel(const Origin& origin, const F& f) const {
+    void forEachVoxel(const Origin& origin, const F& f) const {
         const IntBox box = covered(origin);
-        const bool alongX = std::abs(strides_[0]) < std::abs(strides_[2]);
-        const size_t inner = alongX ? 0 : 2;
+        const size_t inner = innerAxis();
         const size_t outer = 2 - inner;
         Int3 p;
         for (p[outer] = box.lo[outer]; p[outer] < box.hi[outer]; ++p[outer]) {
@@ -134,46 +137,88 @@ class DenseSource : public RegionSource<Value> {
                 auto voxel = static_cast<size_t>((p[0] - origin[0]) * 64 + (p[1] - origin[1]) * 8 +
                                                  p[2] - origin[2]);
                 for (; p[inner] < box.hi[inner]; ++p[inner]) {
-                    if (!f(voxel, from)) {
-                        return false;
-                    }
-                    voxel += alongX ? 64 : 1;
+                    f(voxel, from);
+                    voxel += inner == 0 ? 64 : 1;
                     from += strides_[inner];
                 }
             }
         }
-        return true;
     }
 
+    /// Whether any of `count` components, `stride` bytes apart, is not 0. By their bits, so that a
+    /// row is read as fast as memory is.
+    template <class Bits>
+    static bool anySet(const char* from, int64_t stride, int64_t count) {
+        Bits all = 0;
+        const auto add = [&](int64_t step) {
+            for (int64_t i = 0; i < count; ++i) {
+                Bits bits;
+                std::memcpy(&bits, from + i * step, sizeof(bits));
+                all = static_cast<Bits>(all | bits);
+            }
+        };
+        constexpr auto kNext = static_cast<int64_t>(sizeof(Bits));
+        stride == kNext ? add(kNext) : add(stride);
+        return static_cast<Bits>(all << 1) != 0;  // -0 is 0
+    }
+    /// The same of `count` voxels along an axis.
+    bool anySet(const char* from, size_t axis, int64_t count) const {
+        const size_t component = componentBytes(density_.valueType);
+        const auto width = static_cast<int64_t>(component);
+        constexpr auto kAll = static_cast<int64_t>(kChannels);
+        const bool packed = channelStride_ == width && strides_[axis] == kAll * width;
+        bool any = false;
+        for (int64_t c = 0; c < (packed ? 1 : kAll); ++c) {
+            const char* first = from + c * channelStride_;
+            const int64_t stride = packed ? width : strides_[axis];
+            const int64_t n = packed ? kAll * count : count;
+            any = any || (component == 2   ? anySet<uint16_t>(first, stride, n)
+                          : component == 4 ? anySet<uint32_t>(first, stride, n)
+                                           : anySet<uint64_t>(first, stride, n));
+        }
+        return any;
+    }
+
+    /// Along the array's own rows, so that each is read once, in order.
     void findLeaves() {
         Int3 first;
         Int3 count;
-        size_t all = 1;
         for (size_t a = 0; a < 3; ++a) {
             first[a] = lo_[a] & ~int64_t{7};
             count[a] = (hi_[a] - first[a] + 7) >> 3;
-            all *= static_cast<size_t>(count[a]);
         }
-        const auto originOf = [&](size_t i) {
-            const auto n = static_cast<int64_t>(i);
-            return Origin{{static_cast<int32_t>(first[0] + 8 * (n / (count[1] * count[2]))),
-                           static_cast<int32_t>(first[1] + 8 * (n / count[2] % count[1])),
-                           static_cast<int32_t>(first[2] + 8 * (n % count[2]))}};
-        };
-        std::vector<char> occupied(all);
-        parallelFor(all, 64, [&](size_t i) {
-            occupied[i] = !forEachVoxel(originOf(i), [&](size_t, const char* from) {
-                bool zero = true;
-                for (size_t c = 0; c < kChannels; ++c) {
-                    zero = zero && load<Component>(from + static_cast<int64_t>(c) * channelStride_,
-                                                   density_.valueType) == 0;
+        const size_t inner = innerAxis();
+        const size_t outer = 2 - inner;
+        const std::array<int64_t, 3> places{{count[1] * count[2], count[2], 1}};
+        std::vector<char> occupied(static_cast<size_t>(count[0] * count[1] * count[2]));
+        parallelFor(static_cast<size_t>(count[outer] * count[1]), 1, [&](size_t band) {
+            Int3 leaf{{0, static_cast<int64_t>(band) % count[1], 0}};
+            leaf[outer] = static_cast<int64_t>(band) / count[1];
+            const auto rows = [&](size_t a) {
+                return std::pair(std::max(first[a] + 8 * leaf[a], lo_[a]),
+                                 std::min(first[a] + 8 * leaf[a] + 8, hi_[a]));
+            };
+            char* found =
+                &occupied[static_cast<size_t>(leaf[outer] * places[outer] + leaf[1] * places[1])];
+            Int3 p;
+            for (p[outer] = rows(outer).first; p[outer] < rows(outer).second; ++p[outer]) {
+                for (p[1] = rows(1).first; p[1] < rows(1).second; ++p[1]) {
+                    for (int64_t k = 0; k < count[inner]; ++k) {
+                        char& here = found[k * places[inner]];
+                        p[inner] = std::max(first[inner] + 8 * k, lo_[inner]);
+                        const int64_t end = std::min(first[inner] + 8 * k + 8, hi_[inner]);
+                        here = here || anySet(at(p), inner, end - p[inner]);
+                    }
                 }
-                return zero;
-            });
+            }
         });
-        for (size_t i = 0; i < all; ++i) {
+        for (size_t i = 0; i < occupied.size(); ++i) {
             if (occupied[i]) {
-                this->leafOrigins_.push_back(originOf(i));
+                const auto n = static_cast<int64_t>(i);
+                this->leafOrigins_.push_back(
+                    Origin{{static_cast<int32_t>(first[0] + 8 * (n / places[0])),
+                            static_cast<int32_t>(first[1] + 8 * (n / places[1] % count[1])),
+                            static_cast<int32_t>(first[2] + 8 * (n % count[2]))}});
             }
         }
     }
@@ -194,7 +239,6 @@ class DenseSource : public RegionSource<Value> {
                 components[voxel * kChannels + c] =
                     load<Component>(from + static_cast<int64_t>(c) * channelStride_, type);
             }
-            return true;
         });
     }
 

@@ -1,0 +1,722 @@
+// SPDX-License-Identifier: Apache-2.0
+// What the tracking core takes, and what it gains over what renderers do today (baselines.h), all
+// in one run on one pinned core: core_table FOLDER [FILTER]. Three procedural volumes, made into
+// FOLDER where they are not there yet, camera and secondary rays, mean depths of 1, 10 and 100;
+// then adversarial fields, and what calls, colour and two cores cost. FILTER: part of the names of
+// the sets to run, as "large/camera/1". Writes FOLDER/core.csv, and Markdown tables to stdout.
+//
+// Contestants take turns; times are medians over rounds of this thread's CPU time, variances mean
+// squared errors against exact integration, over rays that hit.
+#include "baselines.h"
+#include "procedural.h"
+#include "support/fixtures.h"
+#include "support/rays.h"
+#include "track/track_openvdb.hpp"
+
+#include <linux/perf_event.h>
+#include <openvdb/tools/Dense.h>
+#include <sched.h>
+#include <sys/ioctl.h>
+#include <sys/syscall.h>
+#include <unistd.h>
+
+#include <algorithm>
+#include <array>
+#include <chrono>
+#include <cmath>
+#include <cstdio>
+#include <cstring>
+#include <ctime>
+#include <filesystem>
+#include <functional>
+#include <map>
+#include <memory>
+#include <random>
+#include <string>
+#include <utility>
+#include <vector>
+
+namespace {
+
+constexpr size_t kRays = 8192;
+constexpr uint64_t kRounds = 7;
+constexpr double kNaN = std::numeric_limits<double>::quiet_NaN();
+constexpr double kWanted[3] = {0.1, 0.01, 0.001};  // V0: what variance there is from elsewhere
+
+// ---- The clock -------------------------------------------------------------------------------
+
+double threadSeconds() {
+    timespec now{};
+    clock_gettime(CLOCK_THREAD_CPUTIME_ID, &now);
+    return static_cast<double>(now.tv_sec) + 1e-9 * static_cast<double>(now.tv_nsec);
+}
+
+double wallSeconds() {
+    return std::chrono::duration<double>(std::chrono::steady_clock::now().time_since_epoch())
+        .count();
+}
+
+/// Cache misses of this thread, where the system tells them.
+class CacheMisses {
+  public:
+    CacheMisses() {
+        perf_event_attr wanted{};
+        wanted.size = sizeof(wanted);
+        wanted.type = PERF_TYPE_HARDWARE;
+        wanted.config = PERF_COUNT_HW_CACHE_MISSES;
+        wanted.exclude_kernel = 1;
+        wanted.exclude_hv = 1;
+        counter_ = static_cast<int>(syscall(SYS_perf_event_open, &wanted, 0, -1, -1, 0));
+    }
+    ~CacheMisses() {
+        if (counter_ >= 0) {
+            close(counter_);
+        }
+    }
+    CacheMisses(const CacheMisses&) = delete;
+    CacheMisses& operator=(const CacheMisses&) = delete;
+
+    double sofar() const {
+        uint64_t count = 0;
+        return counter_ >= 0 && read(counter_, &count, sizeof(count)) == sizeof(count)
+                   ? static_cast<double>(count)
+                   : kNaN;
+    }
+
+  private:
+    int counter_ = -1;
+};
+
+double median(std::vector<double> values) {
+    std::sort(values.begin(), values.end());
+    return values.empty() ? kNaN : values[values.size() / 2];
+}
+
+// ---- Fields and rays -------------------------------------------------------------------------
+
+/// A volume of `voxels` along an edge, from FOLDER or made into it.
+openvdb::FloatGrid::Ptr procedural(const std::string& folder, const std::string& kind, int voxels) {
+    const std::string path = folder + "/" + kind + std::to_string(voxels) + ".vdb";
+    if (!std::filesystem::exists(path)) {
+        vdbtools::ProceduralOptions options;
+        options.kind = kind;
+        options.voxels = voxels;
+        trk::OutputFile file(path, false);
+        vdbtools::writeProcedural(options, file, [](double) {});
+        file.commit();
+    }
+    openvdb::io::File file(path);
+    file.open(/*delayLoad=*/false);
+    return openvdb::gridPtrCast<openvdb::FloatGrid>(file.readGrid("density"));
+}
+
+/// Fields that are hard on estimators, of 96^3 voxels.
+openvdb::FloatGrid::Ptr adversarial(const std::string& name) {
+    constexpr int kEdge = 96;
+    const openvdb::CoordBBox box(0, 0, 0, kEdge - 1, kEdge - 1, kEdge - 1);
+    if (name == "filaments") {
+        openvdb::FloatGrid::Ptr grid = fixtures::makeGrid(box, [](const auto&) { return 0.0f; });
+        std::mt19937_64 random(1);
+        std::uniform_real_distribution<double> unit(0, kEdge);
+        openvdb::FloatGrid::Accessor voxels = grid->getAccessor();
+        for (int line = 0; line < 60; ++line) {
+            const openvdb::Vec3d from(unit(random), unit(random), unit(random));
+            const openvdb::Vec3d to(unit(random), unit(random), unit(random));
+            for (int i = 0; i < 4 * kEdge; ++i) {
+                const openvdb::Vec3d p = from + (to - from) * (i / (4.0 * kEdge));
+                voxels.setValue(openvdb::Coord::floor(p), 1000.0f);
+            }
+        }
+        return grid;
+    }
+    return fixtures::makeGrid(box, [&](const openvdb::Coord& p) {
+        const openvdb::Vec3d fromCentre = p.asVec3d() - openvdb::Vec3d(0.5 * kEdge);
+        if (name == "shells") {
+            return std::fmod(fromCentre.length(), 12) < 1.5 && fromCentre.length() < 46 ? 100.0f
+                                                                                        : 0.0f;
+        }
+        if (name == "pinholes") {  // along z
+            return p.x() % 8 == 4 && p.y() % 8 == 4 ? 0.0f : 10.0f;
+        }
+        if (name == "slabs") {  // beside rays along z
+            return p.x() / 2 % 2 == 0 ? 10.0f : 0.0f;
+        }
+        if (name == "checkerboard") {
+            return (p.x() + p.y() + p.z()) % 2 == 0 ? 1e4f : 0.0f;
+        }
+        return p == openvdb::Coord(kEdge / 2) ? 1e6f : 0.0f;  // a voxel in nothing
+    });
+}
+
+/// The same density in three channels, each a little less.
+openvdb::Vec3SGrid::Ptr threeChannels(const openvdb::FloatGrid& grey) {
+    openvdb::Vec3SGrid::Ptr grid = openvdb::Vec3SGrid::create();
+    grid->setTree(std::make_shared<openvdb::Vec3STree>(grey.tree(), openvdb::Vec3f(0),
+                                                       openvdb::TopologyCopy()));
+    grid->setTransform(grey.transform().copy());
+    grid->setName("density");
+    auto from = grey.tree().cbeginLeaf();
+    for (auto leaf = grid->tree().beginLeaf(); leaf; ++leaf, ++from) {
+        for (openvdb::Index i = 0; i < 512; ++i) {
+            const float value = from->getValue(i);
+            leaf->setValueOnly(i, openvdb::Vec3f(value, 0.9f * value, 0.8f * value));
+        }
+    }
+    return grid;
+}
+
+std::vector<TrkRay> cameraRays(const rays::Box& box) {
+    constexpr int kSide = 160;
+    std::vector<TrkRay> result;
+    for (int y = 0; y < kSide; ++y) {
+        for (int x = 0; x < kSide; ++x) {
+            TrkRay ray{};
+            const double at[3] = {(x + 0.5) / kSide, (y + 0.5) / kSide, 0.5};
+            for (size_t a = 0; a < 3; ++a) {
+                const double edge = box.hi[a] - box.lo[a];
+                const double centre = 0.5 * (box.lo[a] + box.hi[a]);
+                const double eye = centre + (a == 1 ? 1.2 : 2.0) * edge;
+                ray.origin[a] = static_cast<float>(eye);
+                ray.direction[a] = static_cast<float>(box.lo[a] + at[a] * edge - eye);
+            }
+            ray.tMax = rays::kInfinity;
+            result.push_back(ray);
+        }
+    }
+    return result;
+}
+
+/// From points of the density in any direction, as a path tracer's shadow rays.
+std::vector<TrkRay> secondaryRays(const track::Volume& volume, const rays::Box& box) {
+    std::mt19937_64 random(1);
+    std::uniform_real_distribution<double> unit(0, 1);
+    std::vector<TrkRay> result;
+    while (result.size() < kRays) {
+        TrkRay ray{};
+        const auto direction = rays::unitVector(random);
+        for (size_t a = 0; a < 3; ++a) {
+            ray.origin[a] = static_cast<float>(box.lo[a] + unit(random) * (box.hi[a] - box.lo[a]));
+            ray.direction[a] = static_cast<float>(direction[a]);
+        }
+        ray.tMax = rays::kInfinity;
+        float extinction = 0;
+        volume.sampleExtinction(ray.origin, 1, &extinction);
+        if (extinction > 0) {
+            result.push_back(ray);
+        }
+    }
+    return result;
+}
+
+/// Along z, from outside, through random points.
+std::vector<TrkRay> parallelRays(const rays::Box& box) {
+    std::vector<TrkRay> result = rays::through(box, kRays, 0, 1);
+    for (TrkRay& ray : result) {
+        ray.origin[2] = static_cast<float>(box.lo[2] - 1);
+        ray.direction[0] = ray.direction[1] = 0;
+        ray.direction[2] = 1;
+    }
+    return result;
+}
+
+// ---- Contestants -----------------------------------------------------------------------------
+
+/// The fixed ways, never more: a best one chosen in hindsight gains by choice.
+struct FixedWay {
+    const char* name;
+    TrkMethod method;
+    int size = 16;
+    TrkControlKind kind = TRK_CONTROL_CONSTANT;
+    float rate = 1;
+    TrkRateBase base = TRK_RATE_BASE_MAJORANT;
+};
+constexpr FixedWay kWays[16] = {
+    {"exact", TRK_METHOD_EXACT},
+    {"ratio 16", TRK_METHOD_RATIO},
+    {"delta 16", TRK_METHOD_DELTA},
+    {"constant 4", TRK_METHOD_RESIDUAL, 4},
+    {"constant 8", TRK_METHOD_RESIDUAL, 8},
+    {"constant 16", TRK_METHOD_RESIDUAL, 16},
+    {"constant 32", TRK_METHOD_RESIDUAL, 32},
+    {"affine 4", TRK_METHOD_RESIDUAL, 4, TRK_CONTROL_AFFINE},
+    {"affine 8", TRK_METHOD_RESIDUAL, 8, TRK_CONTROL_AFFINE},
+    {"affine 16", TRK_METHOD_RESIDUAL, 16, TRK_CONTROL_AFFINE},
+    {"affine 32", TRK_METHOD_RESIDUAL, 32, TRK_CONTROL_AFFINE},
+    {"constant 8 rate 4", TRK_METHOD_RESIDUAL, 8, TRK_CONTROL_CONSTANT, 4},
+    {"affine 8 rate 4", TRK_METHOD_RESIDUAL, 8, TRK_CONTROL_AFFINE, 4},
+    {"affine 4 rate 4", TRK_METHOD_RESIDUAL, 4, TRK_CONTROL_AFFINE, 4},
+    {"constant 4 rms 2", TRK_METHOD_RESIDUAL, 4, TRK_CONTROL_CONSTANT, 2, TRK_RATE_BASE_RMS},
+    {"affine 8 rms 2", TRK_METHOD_RESIDUAL, 8, TRK_CONTROL_AFFINE, 2, TRK_RATE_BASE_RMS}};
+constexpr const char* kDefaultWay = "constant 16";
+constexpr const char* kBaselineRatio = "(a) NanoVDB ratio";
+constexpr const char* kBaselineExact = "(b) OpenVDB HDDA";
+
+track::Query queryOf(const FixedWay& way, uint64_t seed) {
+    track::Query query(0, 0);
+    query.method = way.method;
+    query.rate = way.rate;
+    query.rateBase = way.base;
+    query.seed = seed;
+    query.threads = 1;
+    return query;
+}
+
+struct Result {
+    std::string name;
+    std::vector<double> seconds;
+    double misses = 0;  // of the cache, over all rounds
+    double squares = 0;
+    uint64_t lookups = 0;    // of one round
+    uint64_t crossings = 0;  // the same
+    double rays = 0;
+
+    double ns() const { return 1e9 * median(seconds) / rays; }
+    double variance() const { return squares / (rays * static_cast<double>(kRounds)); }
+    double score(double wanted) const { return (wanted + variance()) * ns(); }
+    double perRay(uint64_t count) const { return static_cast<double>(count) / rays; }
+};
+
+using Results = std::map<std::string, Result>;
+
+/// A grid and what is compared on it.
+struct Field {
+    std::string name;
+    openvdb::FloatGrid::Ptr grid;
+    std::unique_ptr<baselines::RatioTracking> ratioTracking;
+    std::unique_ptr<baselines::Integration> integration;
+
+    Field(std::string named, openvdb::FloatGrid::Ptr of)
+        : name(std::move(named)),
+          grid(std::move(of)),
+          ratioTracking(std::make_unique<baselines::RatioTracking>(*grid)),
+          integration(std::make_unique<baselines::Integration>(*grid)) {}
+
+    track::Volume open(float scale) const {
+        TrkVolumeOptions options = trkDefaultVolumeOptions();
+        options.noBake = 1;
+        options.scale = scale;
+        return track::makeVolume(*grid, options);
+    }
+};
+
+/// Rays of a field that hit, and the scale that gives them a mean optical depth.
+struct Set {
+    std::string name;
+    const Field& field;
+    std::vector<TrkRay> rays;
+    std::vector<double> exact;  // transmittance
+    float scale = 1;
+
+    Set(std::string named, const Field& of, const std::vector<TrkRay>& from, double meanDepth)
+        : name(std::move(named)), field(of) {
+        const track::Volume volume = field.open(1);
+        std::vector<double> depths(from.size());
+        volume.integrateOpticalDepth(queryOf(kWays[0], 0), from.data(), from.size(), depths.data());
+        double sum = 0;
+        std::vector<double> kept;
+        for (size_t i = 0; i < from.size() && rays.size() < kRays; ++i) {
+            if (depths[i] > 0) {
+                rays.push_back(from[i]);
+                kept.push_back(depths[i]);
+                sum += depths[i];
+            }
+        }
+        scale = static_cast<float>(meanDepth * static_cast<double>(rays.size()) / sum);
+        for (const double depth : kept) {
+            exact.push_back(std::exp(-static_cast<double>(scale) * depth));
+        }
+    }
+};
+
+Results run(const Set& set, const CacheMisses& misses) {
+    std::map<std::pair<int, TrkControlKind>, track::Volume> volumes;
+    for (const FixedWay& way : kWays) {
+        const std::pair key(way.size, way.kind);
+        if (volumes.count(key) == 0) {
+            track::Volume volume = set.field.open(set.scale);
+            TrkBakeOptions options = trkDefaultBakeOptions();
+            options.superVoxelSize = static_cast<uint32_t>(way.size);
+            options.control = way.kind;
+            volume.bake(options);
+            volumes.emplace(key, std::move(volume));
+        }
+    }
+    std::vector<float> out(set.rays.size());
+    const size_t count = set.rays.size();
+    struct Contestant {
+        Result result;
+        std::function<void(uint64_t round)> run;
+    };
+    std::vector<Contestant> contestants;
+    const auto add = [&](const char* name, std::function<void(uint64_t)> body) {
+        Contestant contestant;
+        contestant.result.name = name;
+        contestant.result.rays = static_cast<double>(count);
+        contestant.run = std::move(body);
+        contestants.push_back(std::move(contestant));
+    };
+    uint64_t lookups = 0;
+    uint64_t crossings = 0;
+    add(kBaselineRatio, [&](uint64_t round) {
+        set.field.ratioTracking->transmittance(set.rays.data(), count, set.scale, round, out.data(),
+                                               lookups, crossings);
+    });
+    add(kBaselineExact, [&](uint64_t) {
+        uint64_t cells = 0;
+        set.field.integration->transmittance(set.rays.data(), count, set.scale, out.data(), cells);
+        lookups += 2 * cells;
+    });
+    for (const FixedWay& way : kWays) {
+        const track::Volume& volume = volumes.at({way.size, way.kind});
+        add(way.name, [&volume, &way, &set, &out, count](uint64_t round) {
+            volume.estimateTransmittance(queryOf(way, round), set.rays.data(), count, out.data());
+        });
+    }
+    for (uint64_t round = 0; round < kRounds; ++round) {
+        for (Contestant& contestant : contestants) {
+            Result& result = contestant.result;
+            lookups = crossings = 0;
+            const double missesBefore = misses.sofar();
+            const double start = threadSeconds();
+            contestant.run(round);
+            result.seconds.push_back(threadSeconds() - start);
+            result.misses += misses.sofar() - missesBefore;
+            result.lookups = lookups;
+            result.crossings = crossings;
+            for (size_t i = 0; i < count; ++i) {
+                const double error = static_cast<double>(out[i]) - set.exact[i];
+                result.squares += error * error;
+            }
+        }
+    }
+    Results results;
+    for (Contestant& contestant : contestants) {
+        results[contestant.result.name] = std::move(contestant.result);
+    }
+    track::Statistics statistics(count, 1);
+    for (const FixedWay& way : kWays) {
+        volumes.at({way.size, way.kind})
+            .estimateTransmittance(queryOf(way, 0), set.rays.data(), count, out.data(),
+                                   statistics.view());
+        Result& result = results[way.name];
+        for (size_t i = 0; i < count; ++i) {
+            result.lookups += statistics.lookups[i];
+            result.crossings += statistics.superVoxels[i];
+        }
+    }
+    // Whoever is exact must agree.
+    for (const char* name : {kBaselineExact, "exact"}) {
+        if (!(results[name].variance() < 1e-6)) {
+            std::fprintf(stderr, "core_table: %s: the mean squared error of %s is %g\n",
+                         set.name.c_str(), name, results[name].variance());
+            std::exit(1);
+        }
+    }
+    return results;
+}
+
+// ---- Tables ----------------------------------------------------------------------------------
+
+void writeCsv(std::FILE* csv, const std::string& set, const Results& results) {
+    const Result& a = results.at(kBaselineRatio);
+    for (const auto& [name, r] : results) {
+        std::fprintf(csv, "%s,%s,%.1f,%.3f,%.2f,%.4g,", set.c_str(), name.c_str(), r.ns(),
+                     r.perRay(r.lookups), r.perRay(r.crossings), r.variance());
+        const double misses = r.misses / (r.rays * static_cast<double>(kRounds));
+        if (!std::isnan(misses)) {
+            std::fprintf(csv, "%.2f", misses);
+        }
+        for (const double wanted : kWanted) {
+            std::fprintf(csv, ",%.3f", a.score(wanted) / r.score(wanted));
+        }
+        std::fprintf(csv, "\n");
+    }
+    std::fflush(csv);
+}
+
+/// Of the fixed ways, the one with the least score.
+const Result& bestOf(const Results& results, double wanted) {
+    const Result* best = nullptr;
+    for (const FixedWay& way : kWays) {
+        const Result& r = results.at(way.name);
+        if (!best || r.score(wanted) < best->score(wanted)) {
+            best = &r;
+        }
+    }
+    return *best;
+}
+
+void printSet(const std::string& set, const Results& results) {
+    const auto ns = [&](const char* name) { return results.at(name).ns(); };
+    const Result& exact = results.at("exact");
+    std::printf("| %s | %.0f | %.2f | %.2f | %.2f | %.1f |", set.c_str(), ns(kBaselineRatio),
+                ns(kBaselineExact) / ns("exact"), ns(kDefaultWay) / ns(kBaselineRatio),
+                ns("affine 4") / ns(kBaselineRatio),
+                exact.ns() / (0.5 * exact.perRay(exact.lookups)));
+    // From two rates over the same super-voxels, where roulette ends few walks.
+    const Result& slow = results.at("constant 8 rate 4");
+    const Result& walk = results.at("constant 8");
+    if (set.substr(set.rfind('/')) == "/1") {
+        const double lookup =
+            (slow.ns() - walk.ns()) / (walk.perRay(slow.lookups) - walk.perRay(walk.lookups));
+        std::printf(" %.0f | %.0f |",
+                    (walk.ns() - lookup * walk.perRay(walk.lookups)) / walk.perRay(walk.crossings),
+                    lookup);
+    } else {
+        std::printf(" | |");
+    }
+    for (const double wanted : kWanted) {
+        const double reference = results.at(kBaselineRatio).score(wanted);
+        const Result& best = bestOf(results, wanted);
+        std::printf(" %.2f (%s), %.2f |", reference / best.score(wanted), best.name.c_str(),
+                    reference / results.at(kDefaultWay).score(wanted));
+    }
+    std::printf("\n");
+    std::fflush(stdout);
+}
+
+/// Medians over the sets, and the least.
+void printSummary(const std::vector<Results>& all) {
+    std::printf("\n| gain over (a), median of %zu sets (least) | V0 = 0.1 | 0.01 | 0.001 |\n",
+                all.size());
+    std::printf("|---|---|---|---|\n");
+    const auto row = [&](const char* label, const auto& chosen) {
+        std::printf("| %s |", label);
+        for (const double wanted : kWanted) {
+            std::vector<double> gains;
+            for (const Results& results : all) {
+                gains.push_back(results.at(kBaselineRatio).score(wanted) /
+                                chosen(results, wanted).score(wanted));
+            }
+            std::printf(" %.2f (%.2f) |", median(gains),
+                        *std::min_element(gains.begin(), gains.end()));
+        }
+        std::printf("\n");
+    };
+    row("best fixed way in hindsight", bestOf);
+    row(kDefaultWay,
+        [](const Results& results, double) -> const Result& { return results.at(kDefaultWay); });
+}
+
+/// Medians of `seconds()` around each of some bodies, which take turns.
+std::vector<double> timesOf(const std::vector<std::function<void()>>& bodies, double (*seconds)()) {
+    std::vector<std::vector<double>> times(bodies.size());
+    for (uint64_t round = 0; round < kRounds; ++round) {
+        for (size_t i = 0; i < bodies.size(); ++i) {
+            const double start = seconds();
+            bodies[i]();
+            times[i].push_back(seconds() - start);
+        }
+    }
+    std::vector<double> result;
+    for (const std::vector<double>& t : times) {
+        result.push_back(median(t));
+    }
+    return result;
+}
+
+/// A tint, and a density of three channels, over grey: the first channel, which is the same, sets
+/// the rate, so that look-ups are the same.
+void printColour(const Set& set) {
+    TrkVolumeOptions options = trkDefaultVolumeOptions();
+    options.scale = set.scale;
+    const track::Volume grey = track::makeVolume(*set.field.grid, options);
+    const track::Volume vectors = track::makeVolume(*threeChannels(*set.field.grid), options);
+    options.color[1] = 0.9f;
+    options.color[2] = 0.8f;
+    const track::Volume tinted = track::makeVolume(*set.field.grid, options);
+    std::printf("| %s |", set.name.c_str());
+    std::vector<float> out(3 * set.rays.size());
+    for (const FixedWay& way : {kWays[5], kWays[0]}) {
+        std::vector<std::function<void()>> bodies;
+        for (const track::Volume* volume : {&grey, &tinted, &vectors}) {
+            bodies.push_back([&, volume] {
+                volume->estimateTransmittance(queryOf(way, 0), set.rays.data(), set.rays.size(),
+                                              out.data());
+            });
+        }
+        const std::vector<double> times = timesOf(bodies, threadSeconds);
+        std::printf(" %.0f | %.2f | %.2f |", 1e9 * times[0] / static_cast<double>(set.rays.size()),
+                    times[1] / times[0], times[2] / times[0]);
+    }
+    std::printf("\n");
+    std::fflush(stdout);
+}
+
+/// Single rays, rays that miss, and two cores.
+void printCalls(const Set& set) {
+    TrkVolumeOptions options = trkDefaultVolumeOptions();
+    options.scale = set.scale;
+    const track::Volume volume = track::makeVolume(*set.field.grid, options);
+    const FixedWay& way = kWays[5];
+    std::vector<TrkRay> away = set.rays;
+    for (TrkRay& ray : away) {
+        for (int a = 0; a < 3; ++a) {
+            ray.origin[a] += 1000;  // the procedural volumes are 10 wide
+            ray.direction[a] = std::fabs(ray.direction[a]);
+        }
+    }
+    std::vector<float> out(set.rays.size());
+    const auto single = [&](const std::vector<TrkRay>& from) {
+        track::Query query = queryOf(way, 0);
+        for (size_t i = 0; i < from.size(); ++i) {
+            query.firstRayId = i;
+            volume.estimateTransmittance(query, &from[i], 1, &out[i]);
+        }
+    };
+    const auto batch = [&](const std::vector<TrkRay>& from) {
+        volume.estimateTransmittance(queryOf(way, 0), from.data(), from.size(), out.data());
+    };
+    uint64_t ignored = 0;
+    const std::vector<double> times = timesOf(
+        {[&] {
+             set.field.ratioTracking->transmittance(set.rays.data(), set.rays.size(), set.scale, 0,
+                                                    out.data(), ignored, ignored);
+         },
+         [&] { batch(set.rays); }, [&] { single(set.rays); }, [&] { single(away); }},
+        threadSeconds);
+    std::vector<TrkRay> many;
+    while (many.size() < 100000) {
+        many.insert(many.end(), set.rays.begin(), set.rays.end());
+    }
+    many.resize(100000);
+    std::vector<float> results(many.size());
+    const auto onThreads = [&](int threads) {
+        track::Query query = queryOf(way, 0);
+        query.threads = threads;
+        volume.estimateTransmittance(query, many.data(), many.size(), results.data());
+    };
+    cpu_set_t all;
+    CPU_ZERO(&all);
+    cpu_set_t pinned;
+    sched_getaffinity(0, sizeof(pinned), &pinned);
+    for (int cpu = 0; cpu < CPU_SETSIZE; ++cpu) {
+        CPU_SET(cpu, &all);
+    }
+    sched_setaffinity(0, sizeof(all), &all);
+    const std::vector<double> walls =
+        timesOf({[&] { onThreads(1); }, [&] { onThreads(2); }}, wallSeconds);
+    sched_setaffinity(0, sizeof(pinned), &pinned);
+    const auto ns = [&](double seconds) {
+        return 1e9 * seconds / static_cast<double>(set.rays.size());
+    };
+    std::printf("| %s | %.0f | %.0f | %.2f | %.0f | %.3f | %.2f |\n", set.name.c_str(),
+                ns(times[0]), ns(times[1]), times[2] / times[1], ns(times[3]), times[3] / times[0],
+                walls[0] / walls[1]);
+    std::fflush(stdout);
+}
+
+}  // namespace
+
+int main(int argc, char** argv) {
+    if (argc < 2 || argc > 3) {
+        std::fprintf(stderr, "usage: core_table FOLDER [FILTER]\n");
+        return 2;
+    }
+    const std::string folder = argv[1];
+    const std::string filter = argc > 2 ? argv[2] : "";
+    openvdb::initialize();
+    std::FILE* csv = std::fopen((folder + "/core.csv").c_str(), "w");
+    if (!csv) {
+        std::perror((folder + "/core.csv").c_str());
+        return 1;
+    }
+    struct Source {
+        const char* name;
+        const char* kind;
+        int voxels;
+    };
+    constexpr Source kSources[] = {
+        {"large", "cloud", 675}, {"small", "cloud", 165}, {"smoke", "smoke", 390}};
+    std::map<std::string, Field> fields;
+    // Threads of the machine make the volumes; then one core does everything.
+    for (const Source& source : kSources) {
+        if (std::string(source.name).find(filter.substr(0, filter.find('/'))) == 0) {
+            fields.try_emplace(source.name, source.name,
+                               procedural(folder, source.kind, source.voxels));
+        }
+    }
+    cpu_set_t pinned;
+    CPU_ZERO(&pinned);
+    CPU_SET(static_cast<size_t>(sched_getcpu()), &pinned);
+    sched_setaffinity(0, sizeof(pinned), &pinned);
+    const CacheMisses misses;
+    std::fprintf(csv,
+                 "set,way,ns_per_ray,lookups_per_ray,crossings_per_ray,variance,"
+                 "cache_misses_per_ray,gain_0.1,gain_0.01,gain_0.001\n");
+
+    std::vector<Set> sets;
+    for (const auto& [name, field] : fields) {
+        const track::Volume volume = field.open(1);
+        const rays::Box box = rays::boundsOf(volume.info());
+        std::printf("%s: %.1f million active voxels\n", name.c_str(),
+                    1e-6 * static_cast<double>(volume.info().activeVoxels));
+        for (const char* kind : {"camera", "secondary"}) {
+            const std::vector<TrkRay> from =
+                kind == std::string("camera") ? cameraRays(box) : secondaryRays(volume, box);
+            for (const int depth : {1, 10, 100}) {
+                const std::string set = name + "/" + kind + "/" + std::to_string(depth);
+                if (set.find(filter) != std::string::npos) {
+                    sets.emplace_back(set, field, from, depth);
+                }
+            }
+        }
+    }
+    constexpr const char* kHead =
+        "| set | (a), ns a ray | exact over (b), times as fast | constant 16 over (a), time | "
+        "affine 4 over (a), time | ns a cell | ns a crossing | ns a look-up | best gain over (a) "
+        "(way), the default's: V0 = 0.1 | 0.01 | 0.001 |\n|---|---|---|---|---|---|---|---|---|---|"
+        "---|\n";
+    std::printf("\n%s", kHead);
+    std::vector<Results> all;
+    for (const Set& set : sets) {
+        all.push_back(run(set, misses));
+        writeCsv(csv, set.name, all.back());
+        printSet(set.name, all.back());
+    }
+    if (!all.empty()) {
+        printSummary(all);
+    }
+
+    std::printf("\n%s", kHead);
+    for (const char* name : {"shells", "pinholes", "slabs", "filaments", "checkerboard", "voxel"}) {
+        const std::string set = std::string("adversarial/") + name;
+        if (set.find(filter) == std::string::npos) {
+            continue;
+        }
+        const Field field(name, adversarial(name));
+        const rays::Box box = rays::boundsOf(field.open(1).info());
+        const std::string label = name;
+        // What lies along z is met along z; a single voxel is hit by no chance.
+        std::vector<TrkRay> from = label == "pinholes" || label == "slabs"
+                                       ? parallelRays(box)
+                                       : rays::through(box, 2 * kRays, 200, 1);
+        for (const int depth : {1, 10}) {
+            const Set hard(set + "/" + std::to_string(depth), field, from, depth);
+            const Results results = run(hard, misses);
+            writeCsv(csv, hard.name, results);
+            printSet(hard.name, results);
+        }
+    }
+
+    std::printf(
+        "\n| set | constant 16 in grey, ns a ray | tint over grey | three channels over "
+        "grey | exact in grey, ns a ray | tint | three channels |\n"
+        "|---|---|---|---|---|---|---|\n");
+    for (const Set& set : sets) {
+        if (set.name.find("/1") == set.name.size() - 2) {
+            printColour(set);
+        }
+    }
+    std::printf(
+        "\n| set | (a), ns a ray | constant 16 in a batch, ns a ray | ray by ray over "
+        "batch | a ray that misses, ns | over (a) | two cores over one |\n"
+        "|---|---|---|---|---|---|---|\n");
+    for (const Set& set : sets) {
+        if (set.name.find("/1") == set.name.size() - 2) {
+            printCalls(set);
+        }
+    }
+    std::fclose(csv);
+    return 0;
+}

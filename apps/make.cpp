@@ -2,7 +2,7 @@
 // vdbtrack make: procedural volumes.
 #include "command_line.h"
 
-#include "procedural.h"
+#include "make/procedural.h"
 
 #include <iostream>
 

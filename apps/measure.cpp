@@ -6,8 +6,8 @@
 #include "io/density.h"
 #include "io/output_file.h"
 #include "names.h"
-#include "plot.h"
-#include "report.h"
+#include "report/plot.h"
+#include "report/report.h"
 
 #include <algorithm>
 #include <chrono>
@@ -235,8 +235,7 @@ void run(const Command& command, const std::vector<std::string>& given) {
         const Progress progress(arguments, "reading " + input);
         trk::Density density = trk::loadDensity(input, densityOptionsOf(arguments));
         report.source.summary = density.summary;
-        report.source.field =
-            std::make_shared<const trk::ExtinctionField>(std::move(density.field));
+        report.source.field = std::make_shared<const trk::DensityField>(std::move(density.field));
     }
     if (report.source.field->channels() == 3 && !arguments.given("color")) {
         report.options.color = {{1, 1, 1}};  // it has its own

@@ -1,9 +1,9 @@
 // SPDX-License-Identifier: Apache-2.0
 #include "path_tracer.h"
 
-#include "camera.h"
 #include "parallel.h"
 #include "track/track.hpp"
+#include "view/camera.h"
 
 #include <algorithm>
 #include <atomic>

@@ -5,9 +5,9 @@
 #include "failure.h"
 #include "image.h"
 #include "io/output_file.h"
-#include "lit_preview.h"
 #include "shot.h"
 #include "track/track.hpp"
+#include "view/lit_preview.h"
 
 #include <unistd.h>
 

@@ -3,13 +3,13 @@
 // for.
 #include "command_line.h"
 
-#include "batch.h"
 #include "failure.h"
 #include "io/output_file.h"
 #include "io/sidecar.h"
-#include "known_error.h"
+#include "measure/known_error.h"
 #include "names.h"
 #include "parallel.h"
+#include "query/batch.h"
 #include "ray_file.h"
 #include "track/track.hpp"
 

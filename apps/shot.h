@@ -2,9 +2,9 @@
 // What a preview draws: the picture asked for, its camera and the numbers of its frames.
 #pragma once
 
-#include "camera.h"
 #include "command_line.h"
 #include "track/track.hpp"
+#include "view/camera.h"
 
 #include <array>
 #include <cstdint>

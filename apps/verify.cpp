@@ -2,10 +2,10 @@
 // vdbtrack verify: proves a sidecar's bounds voxel by voxel.
 #include "command_line.h"
 
+#include "bake/verify.h"
 #include "failure.h"
 #include "io/density.h"
 #include "io/sidecar.h"
-#include "verify.h"
 
 #include <filesystem>
 #include <iostream>

@@ -6,8 +6,8 @@
 #include "failure.h"
 #include "parallel.h"
 #include "progress.h"
-#include "sampling.h"
-#include "transmittance.h"
+#include "query/sampling.h"
+#include "query/transmittance.h"
 #include "volume.h"
 
 #include <tbb/task_arena.h>

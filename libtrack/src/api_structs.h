@@ -4,9 +4,9 @@
 #pragma once
 
 #include "bake/bake.h"
-#include "sampling.h"
+#include "query/sampling.h"
+#include "query/transmittance.h"
 #include "track/track.h"
-#include "transmittance.h"
 #include "volume.h"
 
 #include <cstddef>

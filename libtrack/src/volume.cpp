@@ -116,7 +116,7 @@ std::string defaultSidecarPath(const std::string& vdbPath) {
     return path.string() + ".track.vdb";
 }
 
-Volume makeVolume(const DensitySummary& summary, std::shared_ptr<const ExtinctionField> field,
+Volume makeVolume(const DensitySummary& summary, std::shared_ptr<const DensityField> field,
                   const VolumeOptions& options) {
     Volume volume;
     volume.options = options;
@@ -218,7 +218,7 @@ Volume openVolume(const char* vdbPath, const char* sidecarPath, const VolumeOpti
         }
         volume =
             makeVolume(density.summary,
-                       std::make_shared<const ExtinctionField>(std::move(density.field)), options);
+                       std::make_shared<const DensityField>(std::move(density.field)), options);
         if (haveSidecar) {
             sidecar = readSidecar(path, &density.summary, options.check, SidecarParts::kQueries,
                                   options.maxMemory);
@@ -241,7 +241,7 @@ Volume makeVolume(const TrkDensity& given, const VolumeOptions& options) {
         Density density = makeDensity(given, options.repair, options.maxMemory);
         volume =
             makeVolume(density.summary,
-                       std::make_shared<const ExtinctionField>(std::move(density.field)), options);
+                       std::make_shared<const DensityField>(std::move(density.field)), options);
     }
     if (options.bakeMissing) {
         bakeInMemory(volume, options);

@@ -2,9 +2,9 @@
 // An opened volume: everything a query reads, immutable.
 #pragma once
 
-#include "extinction_field.h"
-#include "geometry.h"
-#include "super_voxels.h"
+#include "control/super_voxels.h"
+#include "field/density_field.h"
+#include "space/geometry.h"
 
 #include <algorithm>
 #include <array>
@@ -72,7 +72,7 @@ struct Volume {
 
     /// The density, which several volumes may share, and what is known of its grid; NULL where only
     /// a sidecar is open.
-    std::shared_ptr<const ExtinctionField> field;
+    std::shared_ptr<const DensityField> field;
     std::shared_ptr<const DensitySummary> density;
 
     bool hasSuperVoxels = false;
@@ -132,7 +132,7 @@ class VolumeExtinction {
         field_.table().walk(
             ray, t0, t1,
             [&](SparseTable::Entry entry, const Int3&, int, double tEnter, double tExit) {
-                if (!ExtinctionField::isConstant(entry)) {
+                if (!DensityField::isConstant(entry)) {
                     return visit(static_cast<const std::array<double, C>*>(nullptr), tEnter, tExit);
                 }
                 std::array<float, F> density;
@@ -152,13 +152,13 @@ class VolumeExtinction {
         return result;
     }
 
-    const ExtinctionField& field_;
+    const DensityField& field_;
     std::array<double, C> scales_;
 };
 
 /// A volume of a density in memory, without super-voxels. Throws Error where the options' scale is
 /// too large for it.
-Volume makeVolume(const DensitySummary& summary, std::shared_ptr<const ExtinctionField> field,
+Volume makeVolume(const DensitySummary& summary, std::shared_ptr<const DensityField> field,
                   const VolumeOptions& options);
 
 /// Gives a volume the super-voxels of a bake. `where` names the bake in errors. Throws Error.

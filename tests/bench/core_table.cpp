@@ -8,7 +8,7 @@
 // Contestants take turns; times are medians over rounds of this thread's CPU time, variances mean
 // squared errors against exact integration, over rays that hit.
 #include "baselines.h"
-#include "procedural.h"
+#include "make/procedural.h"
 #include "support/fixtures.h"
 #include "support/rays.h"
 #include "track/track_openvdb.hpp"

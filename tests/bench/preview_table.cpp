@@ -2,10 +2,10 @@
 // What previews of 512x512 cost and how near they come, as Markdown tables: for the procedural
 // cloud of 256^3, or the densities named as arguments, at a scale where the median transmittance
 // is 0.3. Each row runs in a process of its own, so that its peak memory is its own.
-#include "camera.h"
-#include "lit_preview.h"
 #include "support/fixtures.h"
 #include "track/track.hpp"
+#include "view/camera.h"
+#include "view/lit_preview.h"
 
 #include <sys/resource.h>
 #include <sys/wait.h>

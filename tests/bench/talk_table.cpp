@@ -4,13 +4,13 @@
 //
 // libtrack/docs/experiments.md says what they show. Dual scattering is `vdbtrack measure
 // --scatter`.
-#include "estimators/free_path.h"
-#include "estimators/ratio_tracking.h"
-#include "recommendation.h"
+#include "estimate/free_path.h"
+#include "estimate/ratio_tracking.h"
+#include "measure/recommendation.h"
+#include "measure/sweep.h"
 #include "stat/analytic.h"
 #include "stat/test_set.h"
 #include "support/fixtures.h"
-#include "sweep.h"
 
 #include <algorithm>
 #include <cmath>

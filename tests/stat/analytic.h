@@ -2,9 +2,9 @@
 // Media whose every integral is known, for the estimators: no VDB, no bake.
 #pragma once
 
-#include "estimators/tracking.h"
-#include "rng.h"
-#include "super_voxels.h"
+#include "control/super_voxels.h"
+#include "estimate/rng.h"
+#include "estimate/tracking.h"
 
 #include <array>
 #include <cstdint>

@@ -1,11 +1,11 @@
 // SPDX-License-Identifier: Apache-2.0
 // That the random estimators have the exact transmittance as their mean, to the standard error
 // their exact second moment gives, and that a wrong estimator would be noticed.
-#include "estimators/ratio_tracking.h"
-#include "rng.h"
-#include "stat/test_set.h"
+#include "estimate/ratio_tracking.h"
+#include "estimate/rng.h"
 #include "support/fixtures.h"
 #include "support/rays.h"
+#include "test_set.h"
 #include "volume.h"
 
 #include <gtest/gtest.h>

@@ -1,16 +1,16 @@
 // SPDX-License-Identifier: Apache-2.0
 // The formulas for variance and look-ups, met by the estimators on analytic media: no VDB, no
 // bake. And that what is homogeneous costs no look-up and has no noise, in real volumes.
-#include "estimators/exact.h"
-#include "estimators/free_path.h"
-#include "estimators/ratio_tracking.h"
-#include "estimators/ray_marching.h"
-#include "rng.h"
-#include "stat/analytic.h"
+#include "analytic.h"
+#include "estimate/exact.h"
+#include "estimate/free_path.h"
+#include "estimate/ratio_tracking.h"
+#include "estimate/ray_marching.h"
+#include "estimate/rng.h"
+#include "query/variant.h"
 #include "support/fixtures.h"
 #include "support/rays.h"
 #include "track/track.h"
-#include "variant.h"
 #include "volume.h"
 
 #include <gtest/gtest.h>

@@ -1,11 +1,11 @@
 // SPDX-License-Identifier: Apache-2.0
 // That free paths have the distribution they should: against the exact one by Kolmogorov-Smirnov in
 // grey, by weighted bins in colour; and that wrong ones would be noticed.
-#include "estimators/free_path.h"
-#include "rng.h"
-#include "stat/test_set.h"
+#include "estimate/free_path.h"
+#include "estimate/rng.h"
 #include "support/fixtures.h"
 #include "support/rays.h"
+#include "test_set.h"
 #include "volume.h"
 
 #include <gtest/gtest.h>

@@ -1,8 +1,8 @@
 // SPDX-License-Identifier: Apache-2.0
 // That ending walks early changes neither the mean nor, by more than is documented, the variance.
-#include "rng.h"
-#include "stat/test_set.h"
+#include "estimate/rng.h"
 #include "support/fixtures.h"
+#include "test_set.h"
 
 #include <gtest/gtest.h>
 

@@ -1,9 +1,9 @@
 // SPDX-License-Identifier: Apache-2.0
 // What `vdbtrack measure` measures: is it true, and would it notice if it were not?
-#include "sweep.h"
+#include "measure/sweep.h"
 
-#include "recommendation.h"
-#include "strips.h"
+#include "measure/recommendation.h"
+#include "measure/strips.h"
 #include "support/fixtures.h"
 
 #include <gtest/gtest.h>

@@ -1,8 +1,8 @@
 // SPDX-License-Identifier: Apache-2.0
-#include "stat/test_set.h"
+#include "test_set.h"
 
-#include "estimators/exact.h"
-#include "estimators/free_path.h"
+#include "estimate/exact.h"
+#include "estimate/free_path.h"
 #include "support/fixtures.h"
 #include "support/rays.h"
 #include "support/reference.h"

@@ -2,10 +2,10 @@
 // Sets of rays whose estimates are fit for a z-test: exact moments, tails, standard errors.
 #pragma once
 
-#include "estimators/ratio_tracking.h"
-#include "rng.h"
-#include "sweep.h"
-#include "variant.h"
+#include "estimate/ratio_tracking.h"
+#include "estimate/rng.h"
+#include "measure/sweep.h"
+#include "query/variant.h"
 #include "volume.h"
 
 #include <gtest/gtest.h>

@@ -2,7 +2,7 @@
 #include "fixtures.h"
 
 #include "bake/bake.h"
-#include "procedural.h"
+#include "make/procedural.h"
 
 #include <unistd.h>
 
@@ -111,7 +111,7 @@ vdbtools::Source loadSource(const std::string& path) {
     trk::Density density = load(path);
     vdbtools::Source source;
     source.summary = density.summary;
-    source.field = std::make_shared<const trk::ExtinctionField>(std::move(density.field));
+    source.field = std::make_shared<const trk::DensityField>(std::move(density.field));
     return source;
 }
 

@@ -6,7 +6,7 @@
 #include "io/density.h"
 #include "io/openvdb_grids.h"
 #include "io/sidecar.h"
-#include "sweep.h"
+#include "measure/sweep.h"
 
 #include <cstdint>
 #include <functional>

@@ -1,10 +1,10 @@
 // SPDX-License-Identifier: Apache-2.0
 // Densities of three channels: loading, baking, sidecars, proofs.
 #include "bake/bake.h"
+#include "bake/verify.h"
 #include "failure.h"
 #include "io/sidecar.h"
 #include "support/fixtures.h"
-#include "verify.h"
 
 #include <gtest/gtest.h>
 

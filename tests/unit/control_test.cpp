@@ -2,9 +2,9 @@
 // Controls that vary within a super-voxel: their fits, their closed forms, their bounds.
 #include "bake/bake.h"
 #include "bake/control_fit.h"
+#include "query/variant.h"
 #include "support/fixtures.h"
 #include "support/rays.h"
-#include "variant.h"
 
 #include <gtest/gtest.h>
 

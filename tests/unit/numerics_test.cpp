@@ -1,10 +1,10 @@
 // SPDX-License-Identifier: Apache-2.0
 // The small pieces of arithmetic: scaled products, halfs, random numbers, the robust control, maps.
-#include "estimators/scaled_product.h"
-#include "extinction_field.h"
-#include "geometry.h"
-#include "rng.h"
-#include "super_voxels.h"
+#include "control/super_voxels.h"
+#include "estimate/rng.h"
+#include "estimate/scaled_product.h"
+#include "field/density_field.h"
+#include "space/geometry.h"
 
 #include <gtest/gtest.h>
 

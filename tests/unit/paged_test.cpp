@@ -1,10 +1,10 @@
 // SPDX-License-Identifier: Apache-2.0
 // Densities too large for memory: baked and verified a page at a time, to the same bits.
 #include "bake/bake.h"
+#include "bake/verify.h"
 #include "failure.h"
 #include "io/density.h"
 #include "io/sidecar.h"
-#include "verify.h"
 
 #include "support/fixtures.h"
 

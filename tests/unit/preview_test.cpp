@@ -3,10 +3,10 @@
 #include "bake/preview_scale.h"
 #include "failure.h"
 #include "io/sidecar.h"
-#include "lit_preview.h"
+#include "query/transmittance.h"
 #include "support/fixtures.h"
 #include "track/track.h"
-#include "transmittance.h"
+#include "view/lit_preview.h"
 
 #include <gtest/gtest.h>
 #include <tbb/global_control.h>

@@ -1,6 +1,6 @@
 // SPDX-License-Identifier: Apache-2.0
 // Ranking and advice, on sweeps made up for it.
-#include "recommendation.h"
+#include "measure/recommendation.h"
 
 #include <gtest/gtest.h>
 

@@ -3,10 +3,10 @@
 #include "io/sidecar.h"
 
 #include "bake/bake.h"
+#include "bake/verify.h"
 #include "failure.h"
 #include "io/vdb_file.h"
 #include "support/fixtures.h"
-#include "verify.h"
 
 #include <gtest/gtest.h>
 

@@ -1,5 +1,5 @@
 // SPDX-License-Identifier: Apache-2.0
-#include "sparse_table.h"
+#include "field/sparse_table.h"
 
 #include <gtest/gtest.h>
 

@@ -1,9 +1,9 @@
 // SPDX-License-Identifier: Apache-2.0
 // Volumes whose box or tiles are enormous must cost what their leaves cost.
+#include "bake/verify.h"
 #include "support/fixtures.h"
 #include "support/rays.h"
 #include "track/track.hpp"
-#include "verify.h"
 
 #include <gtest/gtest.h>
 

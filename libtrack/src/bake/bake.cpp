@@ -1,13 +1,13 @@
 // SPDX-License-Identifier: Apache-2.0
 #include "bake.h"
 
-#include "../failure.h"
-#include "../parallel.h"
-#include "../progress.h"
 #include "control_fit.h"
+#include "failure.h"
 #include "levels.h"
 #include "moments.h"
+#include "parallel.h"
 #include "preview_scale.h"
+#include "progress.h"
 
 #include <algorithm>
 #include <cmath>
@@ -99,7 +99,7 @@ class Baker {
             {&field_.table()},
             [&](const Int3& origin, int shift) -> std::optional<Entry> {
                 const auto entry = field_.table().uniformEntry(origin, shift);
-                if (!entry || !ExtinctionField::isConstant(*entry)) {
+                if (!entry || !DensityField::isConstant(*entry)) {
                     return std::nullopt;
                 }
                 if (*entry == SparseTable::kEmpty) {
@@ -113,7 +113,7 @@ class Baker {
             // The surface of a large tile repeats a handful of patterns of bricks. Of a lone small
             // super-voxel, to look for it costs more than to bake it.
             [&](const Int3& origin, int shift, SparseTable::Key& key) {
-                return (shift > shift_ || shift > ExtinctionField::kBrickShift) &&
+                return (shift > shift_ || shift > DensityField::kBrickShift) &&
                        field_.table().appendKey(origin, shift, key);
             });
     }
@@ -149,7 +149,7 @@ class Baker {
     /// Calls body(cube) for every cube of a super-voxel: what of it lies in one brick.
     template <class Body>
     void forEachCube(const Int3& origin, const Body& body) const {
-        constexpr auto kEdge = static_cast<int64_t>(ExtinctionField::kBrickEdge);
+        constexpr auto kEdge = static_cast<int64_t>(DensityField::kBrickEdge);
         for (int64_t x = 0; x < size_; x += cube_) {
             for (int64_t y = 0; y < size_; y += cube_) {
                 for (int64_t z = 0; z < size_; z += cube_) {
@@ -166,8 +166,8 @@ class Baker {
 
     /// The first vertex of a cube in one channel, as cubeRow wants it.
     const float* verticesOf(const Cube& cube, size_t channel,
-                            float (&buffer)[ExtinctionField::kBrickVertices]) const {
-        if (ExtinctionField::isConstant(cube.entry)) {
+                            float (&buffer)[DensityField::kBrickVertices]) const {
+        if (DensityField::isConstant(cube.entry)) {
             std::fill(std::begin(buffer), std::end(buffer), field_.constant(cube.entry)[channel]);
             return buffer;
         }
@@ -182,7 +182,7 @@ class Baker {
             CornerMoments& corners = corners_[job * channels_ + c];
             double count = 0;
             forEachCube(jobs_[job], [&](const Cube& cube) {
-                float buffer[ExtinctionField::kBrickVertices];
+                float buffer[DensityField::kBrickVertices];
                 CornerMoments part;
                 add(cubeMoments<M>(verticesOf(cube, c, buffer), part), count++, all);
                 addCorners(part, cube.offset, corners);
@@ -433,7 +433,7 @@ class Baker {
         withEdge(static_cast<size_t>(cube_), [&](auto edge) {
             constexpr size_t kEdge = decltype(edge)::value;
             forEachCube(origin, [&](const Cube& cube) {
-                float buffer[ExtinctionField::kBrickVertices];
+                float buffer[DensityField::kBrickVertices];
                 Vec3d start;
                 for (int a = 0; a < 3; ++a) {
                     start[a] =
@@ -451,7 +451,7 @@ class Baker {
     }
 
     BrickPages& pages_;
-    const ExtinctionField& field_;
+    const DensityField& field_;
     BakeOptions options_;
     ControlKind kind_;
     size_t channels_;
@@ -477,7 +477,7 @@ BakedVolume bake(BrickPages pages, const BakeOptions& options) {
     return baked;
 }
 
-BakeEstimate estimateBake(const ExtinctionField& field, const BakeOptions& options) {
+BakeEstimate estimateBake(const DensityField& field, const BakeOptions& options) {
     BrickPages pages(field);
     return Baker(pages, options).estimate();
 }
@@ -516,7 +516,7 @@ SidecarHeader sidecarHeader(const DensitySummary& source, BrickPages pages,
 
 SidecarHeader writeBake(const OutputFile& file, const DensitySummary& source, BrickPages pages,
                         BakedVolume& baked, uint64_t sidecarBytes) {
-    const ExtinctionField& field = pages.field();
+    const DensityField& field = pages.field();
     const SidecarHeader header = sidecarHeader(source, std::move(pages), baked);
     writeSidecar(file, header, baked, source.anchor);
     // How well values compress was an estimate.

@@ -2,10 +2,10 @@
 // Statistics, control and preview levels of a density: what a sidecar stores.
 #pragma once
 
-#include "../brick_pages.h"
-#include "../extinction_field.h"
-#include "../io/sidecar.h"
-#include "../super_voxels.h"
+#include "control/super_voxels.h"
+#include "field/brick_pages.h"
+#include "field/density_field.h"
+#include "io/sidecar.h"
 
 #include <cstdint>
 #include <string>
@@ -37,7 +37,7 @@ struct BakeEstimate {
     uint64_t superVoxels = 0;  ///< that are not alike
     uint64_t bytes = 0;
 };
-BakeEstimate estimateBake(const ExtinctionField& field, const BakeOptions& options);
+BakeEstimate estimateBake(const DensityField& field, const BakeOptions& options);
 
 /// How large a sidecar of a density of `sourceBytes` as a file may be, pictures included.
 uint64_t sidecarLimit(uint64_t sourceBytes, ControlKind kind);

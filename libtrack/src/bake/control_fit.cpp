@@ -1,8 +1,8 @@
 // SPDX-License-Identifier: Apache-2.0
 #include "control_fit.h"
 
-#include "../hash.h"
-#include "../parallel.h"
+#include "hash.h"
+#include "parallel.h"
 
 #include <algorithm>
 #include <cmath>

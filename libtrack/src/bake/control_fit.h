@@ -3,7 +3,7 @@
 // values over all of them together.
 #pragma once
 
-#include "../geometry.h"
+#include "space/geometry.h"
 
 #include <array>
 #include <cstddef>

@@ -1,9 +1,9 @@
 // SPDX-License-Identifier: Apache-2.0
 #include "levels.h"
 
-#include "../hash.h"
-#include "../parallel.h"
+#include "hash.h"
 #include "moments.h"
+#include "parallel.h"
 
 #include <algorithm>
 #include <array>
@@ -84,8 +84,8 @@ ValueTable nextLevel(const SparseTable& finer, const IntBox& box, size_t channel
 
 /// Means of the cubes of 2^shift cells of a field.
 ValueTable meansOf(BrickPages& pages, int shift) {
-    const ExtinctionField& field = pages.field();
-    if (shift > ExtinctionField::kBrickShift) {
+    const DensityField& field = pages.field();
+    if (shift > DensityField::kBrickShift) {
         const ValueTable finer = meansOf(pages, shift - 1);
         return nextLevel(finer.table, field.box(), field.channels(), [&](size_t item, size_t c) {
             return finer.values[item * field.channels() + c];
@@ -100,7 +100,7 @@ ValueTable meansOf(BrickPages& pages, int shift) {
     const auto bricksOf = [&](size_t i, const auto& f) { f(bricks[i]); };
     pages.forEach(bricks.size(), 32, bricksOf, [&](size_t i) {
         const size_t b = bricks[i] - 1;
-        float buffer[ExtinctionField::kBrickVertices];
+        float buffer[DensityField::kBrickVertices];
         for (size_t c = 0; c < channels; ++c) {
             const float* brick = pages.brickChannel(bricks[i], c, buffer);
             withEdge(edge, [&](auto m) {
@@ -128,7 +128,7 @@ ValueTable meansOf(BrickPages& pages, int shift) {
         {&field.table()},
         [&](const Int3& origin, int regionShift) -> std::optional<SparseTable::Entry> {
             const auto entry = field.table().uniformEntry(origin, regionShift);
-            if (!entry || !ExtinctionField::isConstant(*entry)) {
+            if (!entry || !DensityField::isConstant(*entry)) {
                 return std::nullopt;
             }
             const auto known = constants.find(*entry);
@@ -142,7 +142,7 @@ ValueTable meansOf(BrickPages& pages, int shift) {
             return add(&brickMeans[((entry - 1) * cubes + k) * channels]);
         },
         [&](const Int3& origin, int regionShift, SparseTable::Key& key) {
-            return regionShift > ExtinctionField::kBrickShift &&
+            return regionShift > DensityField::kBrickShift &&
                    field.table().appendKey(origin, regionShift, key);
         });
     return means;
@@ -186,7 +186,7 @@ void addLevels(BakedVolume& baked, const IntBox& box, int count) {
 }
 
 void addPreview(BakedVolume& baked, BrickPages& pages, uint64_t sidecarBytes) {
-    const ExtinctionField& field = pages.field();
+    const DensityField& field = pages.field();
     const auto brickCount = static_cast<double>(pages.bricks().size());
     constexpr int64_t kFinest =
         160;                       // cubes along the longest edge: about three pixels of 512 each
@@ -198,7 +198,7 @@ void addPreview(BakedVolume& baked, BrickPages& pages, uint64_t sidecarBytes) {
     const int64_t extent = largestExtent(field.box());
     for (int shift = 0; shift < baked.superVoxelShift; ++shift) {
         // Bricks may hold much emptiness, but not so much.
-        const double most = brickCount * std::pow(8.0, ExtinctionField::kBrickShift - shift);
+        const double most = brickCount * std::pow(8.0, DensityField::kBrickShift - shift);
         if (extent >> shift > kFinest || bytesOf(most / 4) > room) {
             continue;
         }
@@ -211,7 +211,7 @@ void addPreview(BakedVolume& baked, BrickPages& pages, uint64_t sidecarBytes) {
     }
 }
 
-void coarsenPreview(BakedVolume& baked, const ExtinctionField& field) {
+void coarsenPreview(BakedVolume& baked, const DensityField& field) {
     baked.previewSize *= 2;
     if (baked.previewSize >= baked.superVoxelSize()) {
         baked.previewSize = 0;

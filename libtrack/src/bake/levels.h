@@ -3,9 +3,9 @@
 // super-voxels.
 #pragma once
 
-#include "../brick_pages.h"
-#include "../extinction_field.h"
-#include "../super_voxels.h"
+#include "control/super_voxels.h"
+#include "field/brick_pages.h"
+#include "field/density_field.h"
 
 #include <cstdint>
 
@@ -22,6 +22,6 @@ void addPreview(BakedVolume& baked, BrickPages& pages, uint64_t sidecarBytes);
 
 /// Makes the cubes for pictures twice as large, or where they would be as large as super-voxels
 /// drops them.
-void coarsenPreview(BakedVolume& baked, const ExtinctionField& field);
+void coarsenPreview(BakedVolume& baked, const DensityField& field);
 
 }  // namespace trk

@@ -3,9 +3,9 @@
 // which the compiler turns into vector code; the order is always the same.
 #pragma once
 
-#include "../control_shape.h"
-#include "../extinction_field.h"
+#include "control/control_shape.h"
 #include "control_fit.h"
+#include "field/density_field.h"
 
 #include <algorithm>
 #include <cmath>
@@ -55,9 +55,9 @@ auto withEdge(size_t edge, const F& f) {
 }
 
 /// The first vertex of a row of a cube, given the cube's own, of a channel as
-/// ExtinctionField::brickChannel gives it.
+/// DensityField::brickChannel gives it.
 inline const float* cubeRow(const float* cube, size_t x, size_t y) {
-    return cube + (x * ExtinctionField::kBrickEdge + y) * ExtinctionField::kBrickEdge;
+    return cube + (x * DensityField::kBrickEdge + y) * DensityField::kBrickEdge;
 }
 
 /// The sum of weight x term(value, z) over the vertices of a cube of M^3 cells; f(x, y, row) gives

@@ -102,7 +102,7 @@ double twoDigits(double value) {
 }  // namespace
 
 double previewScale(BrickPages pages, const AffineMap& indexToWorld) {
-    const ExtinctionField& field = pages.field();
+    const DensityField& field = pages.field();
     constexpr size_t kPlaces = 256;
     size_t count = 0;
     field.table().forEach([&](const Int3&, int, SparseTable::Entry) { ++count; });

@@ -2,8 +2,8 @@
 // At which scale a volume shows well in a picture: a property of the volume alone.
 #pragma once
 
-#include "../brick_pages.h"
-#include "../geometry.h"
+#include "field/brick_pages.h"
+#include "space/geometry.h"
 
 namespace trk {
 

@@ -1,10 +1,10 @@
 // SPDX-License-Identifier: Apache-2.0
 #include "active_grid.h"
 
-#include "../failure.h"
-#include "../hash.h"
-#include "../sparse_table.h"
 #include "density_types.h"
+#include "failure.h"
+#include "field/sparse_table.h"
+#include "hash.h"
 #include "vdb_tree.h"
 
 #include <tbb/spin_mutex.h>

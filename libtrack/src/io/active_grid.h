@@ -3,7 +3,7 @@
 // thousands of them.
 #pragma once
 
-#include "../geometry.h"
+#include "space/geometry.h"
 #include "vdb_file.h"
 
 #include <array>

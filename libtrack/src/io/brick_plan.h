@@ -3,10 +3,10 @@
 // pass over the leaves kept of them.
 #pragma once
 
-#include "../extinction_field.h"
-#include "../hash.h"
-#include "../progress.h"
 #include "density_types.h"
+#include "field/density_field.h"
+#include "hash.h"
+#include "progress.h"
 #include "region_source.h"
 
 #include <algorithm>
@@ -96,7 +96,7 @@ class BrickPlan {
     /// size.
     BrickPlan(const RegionSource<Value>& source, const LeafTraits<Value>& leaves,
               const Int3& anchor, const IntBox& box)
-        : leaves_(leaves), table_(ExtinctionField::kBrickShift, box) {
+        : leaves_(leaves), table_(DensityField::kBrickShift, box) {
         for (size_t i = 0; i < leaves.alike.size(); ++i) {
             if (leaves.isConstant(i)) {
                 unused_.push_back(i);
@@ -121,7 +121,7 @@ class BrickPlan {
                unused_.capacity() * sizeof(size_t);
     }
 
-    static bool isLeaf(Entry entry) { return !ExtinctionField::isConstant(entry); }
+    static bool isLeaf(Entry entry) { return !DensityField::isConstant(entry); }
     /// Of an entry that is no leaf.
     const FieldValue& constantOf(Entry entry) const {
         static constexpr FieldValue kNothing{};
@@ -147,7 +147,7 @@ class BrickPlan {
     }
 
   private:
-    static constexpr Entry kConstantFlag = ExtinctionField::kConstantFlag;
+    static constexpr Entry kConstantFlag = DensityField::kConstantFlag;
     static constexpr size_t kChannels = ValueTraits<Value>::kChannels;
     using Origin = typename RegionSource<Value>::Origin;
 
@@ -172,7 +172,7 @@ class BrickPlan {
     /// The regions of the source: leaves, and constants where a leaf or tile has one value.
     SparseTable sourceTable(const RegionSource<Value>& source, const Int3& anchor,
                             const IntBox& box) {
-        SparseTable table(ExtinctionField::kBrickShift, box);
+        SparseTable table(DensityField::kBrickShift, box);
         std::vector<SparseTable::Place> places;
         places.reserve(source.leafCount());
         const auto local = [&](const Origin& o) {
@@ -183,7 +183,7 @@ class BrickPlan {
                 leaves_.isConstant(i) ? constantEntry(leaves_.first[i]) : static_cast<Entry>(i + 1);
             if (entry != SparseTable::kEmpty) {
                 places.push_back(
-                    {local(source.leafOrigins()[i]), ExtinctionField::kBrickShift, entry});
+                    {local(source.leafOrigins()[i]), DensityField::kBrickShift, entry});
             }
         }
         for (const Tile<Value>& tile : source.tiles()) {
@@ -230,7 +230,7 @@ class BrickPlan {
         if (same && !isLeaf(corners[0])) {
             return corners[0];
         }
-        if (shift > ExtinctionField::kBrickShift) {
+        if (shift > DensityField::kBrickShift) {
             return std::nullopt;
         }
         const bool fromLeaves = std::any_of(corners.begin(), corners.end(), isLeaf);

@@ -1,8 +1,8 @@
 // SPDX-License-Identifier: Apache-2.0
 #include "density.h"
 
-#include "../failure.h"
 #include "density_types.h"
+#include "failure.h"
 #include "field_builder.h"
 #include "memory_source.h"
 #include "tree_bricks.h"
@@ -124,7 +124,7 @@ Density fromSource(RegionSource<Value>& source, uint32_t repair, uint64_t maxMem
 
 template <class Value>
 uint64_t brickBytes(bool half) {
-    return ExtinctionField::kBrickVertices * ValueTraits<Value>::kChannels *
+    return DensityField::kBrickVertices * ValueTraits<Value>::kChannels *
            (half ? sizeof(uint16_t) : sizeof(float));
 }
 

@@ -2,10 +2,10 @@
 // The one loader, for baking and for queries: a grid of a .vdb file becomes an extinction field.
 #pragma once
 
-#include "../brick_pages.h"
-#include "../extinction_field.h"
-#include "../geometry.h"
-#include "../volume.h"
+#include "field/brick_pages.h"
+#include "field/density_field.h"
+#include "space/geometry.h"
+#include "volume.h"
 
 #include <cstdint>
 #include <memory>
@@ -52,7 +52,7 @@ struct DensitySummary {
 
 struct Density {
     DensitySummary summary;
-    ExtinctionField field;                ///< in local space: index space minus summary.anchor
+    DensityField field;                   ///< in local space: index space minus summary.anchor
     std::unique_ptr<BrickLoader> loader;  ///< of the field's bricks, where it holds none
 
     uint64_t pageBytes = 0;  ///< and of a page of them
@@ -76,7 +76,7 @@ struct DensityEstimate {
     uint64_t heldBytes = 0;    ///< by the field; half of it where a file of floats has halfs alone
     uint64_t peakBytes = 0;    ///< while it is loaded
     uint64_t loaderBytes = 0;  ///< without bricks and with a page, at least
-    ExtinctionField field;     ///< of as many bricks, without them
+    DensityField field;        ///< of as many bricks, without them
 };
 /// Reads the grid's structure. Throws Error.
 DensityEstimate estimateDensity(const std::string& path, const DensityOptions& options);

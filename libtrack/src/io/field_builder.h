@@ -4,11 +4,11 @@
 // with leaves and tiles, not with boxes; beside the field itself only lists are held.
 #pragma once
 
-#include "../extinction_field.h"
-#include "../failure.h"
-#include "../parallel.h"
 #include "brick_plan.h"
 #include "density_types.h"
+#include "failure.h"
+#include "field/density_field.h"
+#include "parallel.h"
 #include "region_scan.h"
 #include "region_source.h"
 
@@ -58,12 +58,12 @@ class FieldBuilder {
 
     /// The field, in space relative to `anchor`, a multiple of every tile's size; values that are
     /// negative or not finite count as 0.
-    ExtinctionField build(const Int3& anchor);
+    DensityField build(const Int3& anchor);
 
   private:
     using Entry = SparseTable::Entry;
     static constexpr size_t kChannels = ValueTraits<Value>::kChannels;
-    static constexpr size_t kBrickValues = ExtinctionField::kBrickVertices * kChannels;
+    static constexpr size_t kBrickValues = DensityField::kBrickVertices * kChannels;
     using FieldValue = Sample<Value>;
 
     template <class Stored>
@@ -71,7 +71,7 @@ class FieldBuilder {
     /// Beside the lists of the source.
     void checkMemory(uint64_t wanted) const;
     template <class Stored>
-    ExtinctionField finish(RawArray<Stored>& values, const Int3& anchor);
+    DensityField finish(RawArray<Stored>& values, const Int3& anchor);
 
     RegionSource<Value>& source_;
     uint64_t maxMemory_;
@@ -154,7 +154,7 @@ const RegionScan& FieldBuilder<Value>::scan() {
 
 template <class Value>
 template <class Stored>
-ExtinctionField FieldBuilder<Value>::finish(RawArray<Stored>& values, const Int3& anchor) {
+DensityField FieldBuilder<Value>::finish(RawArray<Stored>& values, const Int3& anchor) {
     BrickPlan<Value> plan(source_, leaves_, anchor, scan_.localBox(anchor));
     checkMemory(plan.slots() * kBrickValues * sizeof(Stored) + leaves_.bytes() +
                 plan.table().bytes());
@@ -183,13 +183,13 @@ ExtinctionField FieldBuilder<Value>::finish(RawArray<Stored>& values, const Int3
         }
         values.resize(next * kBrickValues);
         table = table.mapped(
-            [&](Entry entry) { return ExtinctionField::isConstant(entry) ? entry : moved[entry]; });
+            [&](Entry entry) { return DensityField::isConstant(entry) ? entry : moved[entry]; });
     }
     return {kChannels, std::move(table), plan.constants(), std::move(floats_), std::move(halfs_)};
 }
 
 template <class Value>
-ExtinctionField FieldBuilder<Value>::build(const Int3& anchor) {
+DensityField FieldBuilder<Value>::build(const Int3& anchor) {
     return asHalfs_ ? finish(halfs_, anchor) : finish(floats_, anchor);
 }
 

@@ -1,7 +1,7 @@
 // SPDX-License-Identifier: Apache-2.0
 #include "file_reader.h"
 
-#include "../failure.h"
+#include "failure.h"
 
 #include <fcntl.h>
 #include <sys/stat.h>

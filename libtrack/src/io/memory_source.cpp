@@ -1,10 +1,10 @@
 // SPDX-License-Identifier: Apache-2.0
 #include "memory_source.h"
 
-#include "../extinction_field.h"
-#include "../failure.h"
-#include "../parallel.h"
 #include "density_types.h"
+#include "failure.h"
+#include "field/density_field.h"
+#include "parallel.h"
 
 #include <tbb/parallel_sort.h>
 

@@ -3,11 +3,11 @@
 // extent.
 #pragma once
 
-#include "../failure.h"
-#include "../geometry.h"
-#include "../hash.h"
 #include "density_types.h"
+#include "failure.h"
+#include "hash.h"
 #include "region_source.h"
+#include "space/geometry.h"
 
 #include <algorithm>
 #include <array>

@@ -3,7 +3,7 @@
 // in libtrack/docs/sidecar.md.
 #pragma once
 
-#include "../super_voxels.h"
+#include "control/super_voxels.h"
 #include "density.h"
 #include "output_file.h"
 

@@ -1,8 +1,8 @@
 // SPDX-License-Identifier: Apache-2.0
 #include "sidecar_header.h"
 
-#include "../failure.h"
 #include "density_types.h"
+#include "failure.h"
 #include "sidecar_schema.h"
 
 #include <cmath>

@@ -1,10 +1,10 @@
 // SPDX-License-Identifier: Apache-2.0
 #include "sidecar.h"
 
-#include "../failure.h"
-#include "../hash.h"
 #include "active_grid.h"
 #include "density_types.h"
+#include "failure.h"
+#include "hash.h"
 #include "sidecar_header.h"
 #include "sidecar_schema.h"
 #include "vdb_file.h"

@@ -3,8 +3,8 @@
 // transforms.
 #pragma once
 
-#include "../geometry.h"
-#include "../super_voxels.h"
+#include "control/super_voxels.h"
+#include "space/geometry.h"
 
 #include <algorithm>
 #include <cmath>

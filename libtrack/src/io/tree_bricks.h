@@ -3,8 +3,8 @@
 // over its leaves, and reading some of them again.
 #pragma once
 
-#include "../brick_pages.h"
 #include "brick_plan.h"
+#include "field/brick_pages.h"
 #include "field_builder.h"
 #include "vdb_file.h"
 #include "vdb_tree.h"
@@ -63,7 +63,7 @@ class TreeBricks : public BrickLoader {
     }
 
     /// The field without its bricks. To be called once.
-    ExtinctionField field() {
+    DensityField field() {
         return {kChannels, std::move(plan_.table()), plan_.constants(), {}, {}};
     }
 
@@ -131,7 +131,7 @@ class TreeBricks : public BrickLoader {
 
   private:
     static constexpr size_t kChannels = ValueTraits<Value>::kChannels;
-    static constexpr size_t kBrickValues = ExtinctionField::kBrickVertices * kChannels;
+    static constexpr size_t kBrickValues = DensityField::kBrickVertices * kChannels;
     static constexpr uint32_t kNone = 0xffffffffu;
     static constexpr uint32_t kWhole = 0x80000000u;  // a brick, not a leaf alone
 

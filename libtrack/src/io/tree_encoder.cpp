@@ -1,7 +1,7 @@
 // SPDX-License-Identifier: Apache-2.0
 #include "tree_encoder.h"
 
-#include "../parallel.h"
+#include "parallel.h"
 
 #include <blosc.h>
 

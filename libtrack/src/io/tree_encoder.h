@@ -3,7 +3,7 @@
 // work and memory go with what is occupied, where OpenVDB takes 300 kB for a single voxel.
 #pragma once
 
-#include "../sparse_table.h"
+#include "field/sparse_table.h"
 #include "openvdb_grids.h"
 
 #include <array>

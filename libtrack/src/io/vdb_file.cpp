@@ -1,8 +1,8 @@
 // SPDX-License-Identifier: Apache-2.0
 #include "vdb_file.h"
 
-#include "../failure.h"
 #include "density_types.h"
+#include "failure.h"
 #include "vdb_tree.h"
 #include "vdb_values.h"
 

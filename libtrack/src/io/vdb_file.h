@@ -4,9 +4,9 @@
 // before memory is taken for them, and what is not known is an Error that names file and byte.
 #pragma once
 
-#include "../geometry.h"
 #include "file_reader.h"
 #include "openvdb_grids.h"
+#include "space/geometry.h"
 
 #include <cstdint>
 #include <map>

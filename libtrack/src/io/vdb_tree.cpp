@@ -1,10 +1,10 @@
 // SPDX-License-Identifier: Apache-2.0
 #include "vdb_tree.h"
 
-#include "../failure.h"
-#include "../hash.h"
-#include "../progress.h"
 #include "density_types.h"
+#include "failure.h"
+#include "hash.h"
+#include "progress.h"
 
 #include <tbb/parallel_pipeline.h>
 #include <tbb/task_arena.h>

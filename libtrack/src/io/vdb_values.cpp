@@ -1,8 +1,8 @@
 // SPDX-License-Identifier: Apache-2.0
 #include "vdb_values.h"
 
-#include "../failure.h"
 #include "density_types.h"
+#include "failure.h"
 
 #include <blosc.h>
 

@@ -2,11 +2,11 @@
 #include "procedural.h"
 
 #include "failure.h"
-#include "geometry.h"
 #include "io/density_types.h"
 #include "io/tree_encoder.h"
 #include "io/vdb_writer.h"
 #include "parallel.h"
+#include "space/geometry.h"
 
 #include <algorithm>
 #include <array>

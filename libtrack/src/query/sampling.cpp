@@ -2,9 +2,9 @@
 #include "sampling.h"
 
 #include "batch.h"
-#include "estimators/free_path.h"
+#include "estimate/free_path.h"
+#include "estimate/rng.h"
 #include "failure.h"
-#include "rng.h"
 #include "variant.h"
 
 #include <algorithm>

@@ -2,10 +2,10 @@
 // The voxels of a density as a proof looks them up: from the file, without bricks.
 #pragma once
 
-#include "geometry.h"
+#include "field/sparse_table.h"
 #include "io/density_types.h"
 #include "io/vdb_tree.h"
-#include "sparse_table.h"
+#include "space/geometry.h"
 
 #include <algorithm>
 #include <array>

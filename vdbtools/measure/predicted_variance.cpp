@@ -1,10 +1,10 @@
 // SPDX-License-Identifier: Apache-2.0
 #include "predicted_variance.h"
 
-#include "batch.h"
-#include "estimators/ratio_tracking.h"
+#include "estimate/ratio_tracking.h"
+#include "query/batch.h"
+#include "query/variant.h"
 #include "sweep_rays.h"
-#include "variant.h"
 
 #include <algorithm>
 #include <cmath>

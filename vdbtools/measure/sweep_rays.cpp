@@ -1,9 +1,9 @@
 // SPDX-License-Identifier: Apache-2.0
 #include "sweep_rays.h"
 
-#include "camera.h"
-#include "extinction_field.h"
-#include "transmittance.h"
+#include "field/density_field.h"
+#include "query/transmittance.h"
+#include "view/camera.h"
 
 #include <algorithm>
 #include <cmath>

@@ -3,7 +3,7 @@
 #pragma once
 
 #include "camera.h"
-#include "sparse_table.h"
+#include "field/sparse_table.h"
 #include "volume.h"
 
 #include <array>

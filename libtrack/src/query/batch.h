@@ -2,7 +2,7 @@
 // What queries of many rays share: checking them before any result is written, and running them.
 #pragma once
 
-#include "estimators/tracking.h"
+#include "estimate/tracking.h"
 #include "parallel.h"
 #include "track/track.h"
 #include "volume.h"

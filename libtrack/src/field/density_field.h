@@ -72,7 +72,7 @@ inline void storeExactly(float value, uint16_t& to) {
 /// all agree are not stored: their entry is a constant, and so are larger regions. All values are
 /// finite and not negative, the channels of a vertex side by side. Storage is half where that is
 /// exact for every value. Functions with a parameter C want the field's number of channels.
-class ExtinctionField {
+class DensityField {
   public:
     using Entry = SparseTable::Entry;
 
@@ -82,12 +82,12 @@ class ExtinctionField {
     static constexpr size_t kBrickVertices = kBrickEdge * kBrickEdge * kBrickEdge;
     static constexpr Entry kConstantFlag = 0x40000000u;  ///< else: index of a brick, plus one
 
-    ExtinctionField() = default;
+    DensityField() = default;
 
     /// Bricks lie one after another in `floats` or `halfs`, x slowest; the other one is empty.
     /// `constants`: `channels` values each.
-    ExtinctionField(size_t channels, SparseTable table, std::vector<float> constants,
-                    RawArray<float> floats, RawArray<uint16_t> halfs);
+    DensityField(size_t channels, SparseTable table, std::vector<float> constants,
+                 RawArray<float> floats, RawArray<uint16_t> halfs);
 
     size_t channels() const { return channels_; }
 
@@ -263,8 +263,8 @@ class ExtinctionField {
 };
 
 template <size_t C, class Stored, class Visit>
-bool ExtinctionField::walkBrick(const Stored* brick, const Int3& lo, const LocalRay& ray, double t0,
-                                double t1, Visit&& visit) {
+bool DensityField::walkBrick(const Stored* brick, const Int3& lo, const LocalRay& ray, double t0,
+                             double t1, Visit&& visit) {
     constexpr std::ptrdiff_t kStride[3] = {81 * C, 9 * C, C};
     constexpr double kGauss = 0.57735026918962576451;  // 1/sqrt(3)
     double origin[3];

@@ -3,7 +3,7 @@
 #pragma once
 
 #include "control_shape.h"
-#include "sparse_table.h"
+#include "field/sparse_table.h"
 #include "track/track.h"
 
 #include <algorithm>

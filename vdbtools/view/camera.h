@@ -2,7 +2,7 @@
 // Pinhole cameras that look at a volume.
 #pragma once
 
-#include "geometry.h"
+#include "space/geometry.h"
 #include "track/track.h"
 
 #include <string>

@@ -5,7 +5,7 @@
 #include "io/sidecar.h"
 #include "io/sidecar_schema.h"
 #include "parallel.h"
-#include "variant.h"
+#include "query/variant.h"
 
 #include <algorithm>
 #include <atomic>
@@ -15,7 +15,7 @@
 
 namespace vdbtools {
 
-using trk::ExtinctionField;
+using trk::DensityField;
 using trk::Int3;
 using trk::LocalRay;
 using trk::SparseTable;
@@ -112,11 +112,11 @@ class DepthInCell {
 
 /// Whether the light at a vertex of a brick is ever looked up: a cell beside it holds something. In
 /// constant regions it always is.
-bool isNeeded(const ExtinctionField& field, SparseTable::Entry entry, const Int3& at) {
-    if (ExtinctionField::isConstant(entry)) {
+bool isNeeded(const DensityField& field, SparseTable::Entry entry, const Int3& at) {
+    if (DensityField::isConstant(entry)) {
         return true;
     }
-    constexpr int64_t kEdge = ExtinctionField::kBrickEdge;
+    constexpr int64_t kEdge = DensityField::kBrickEdge;
     const auto lo = [&](size_t a) { return std::max<int64_t>(at[a] - 1, 0); };
     const auto hi = [&](size_t a) { return std::min<int64_t>(at[a] + 1, kEdge - 1); };
     for (int64_t x = lo(0); x <= hi(0); ++x) {
@@ -229,22 +229,21 @@ LitPreview::Light LitPreview::computeLight(const Vec3d& local) const {
 /// Tabulates the light at the corners of a brick's cells, of those that hold anything, and more
 /// coarsely in constant regions.
 void LitPreview::tabulateLight() {
-    const ExtinctionField& field = *volume_.field;
+    const DensityField& field = *volume_.field;
     size_t places = 0;
     const auto add = [&](const Int3& origin, int shift, SparseTable::Entry entry) {
-        const bool coarse =
-            ExtinctionField::isConstant(entry) && shift == ExtinctionField::kBrickShift;
-        const int64_t cells = coarse ? 1 : ExtinctionField::kBrickSize;
+        const bool coarse = DensityField::isConstant(entry) && shift == DensityField::kBrickShift;
+        const int64_t cells = coarse ? 1 : DensityField::kBrickSize;
         regions_.push_back({origin, shift, entry, cells, places});
         places += static_cast<size_t>((cells + 1) * (cells + 1) * (cells + 1));
         return static_cast<SparseTable::Entry>(regions_.size());
     };
-    table_ = SparseTable(ExtinctionField::kBrickShift, field.box());
+    table_ = SparseTable(DensityField::kBrickShift, field.box());
     table_.fill(
         {&field.table()},
         [&](const Int3& origin, int shift) -> std::optional<SparseTable::Entry> {
             const auto found = field.table().find(origin[0], origin[1], origin[2]);
-            if (found.shift < shift || !ExtinctionField::isConstant(found.entry)) {
+            if (found.shift < shift || !DensityField::isConstant(found.entry)) {
                 return std::nullopt;
             }
             return found.entry == SparseTable::kEmpty ? SparseTable::kEmpty
@@ -252,7 +251,7 @@ void LitPreview::tabulateLight() {
         },
         [&](const Int3& origin) {
             const auto found = field.table().find(origin[0], origin[1], origin[2]);
-            return add(origin, ExtinctionField::kBrickShift, found.entry);
+            return add(origin, DensityField::kBrickShift, found.entry);
         });
     light_.resize(places);
     trk::parallelFor(regions_.size(), 1, [&](size_t r) {
@@ -399,16 +398,16 @@ void LitPreview::drawPixel(const TrkRay& ray, double farDepth, Picture& picture,
 }
 
 WorldBox LitPreview::box() const {
-    const ExtinctionField& field = *volume_.field;
+    const DensityField& field = *volume_.field;
     trk::IntBox content;
     field.table().forEach([&](const Int3& lo, int shift, SparseTable::Entry entry) {
         const int64_t size = int64_t{1} << shift;
-        if (ExtinctionField::isConstant(entry)) {
+        if (DensityField::isConstant(entry)) {
             content.add(lo, {{lo[0] + size, lo[1] + size, lo[2] + size}});
             return;
         }
-        constexpr auto kEdge = static_cast<size_t>(ExtinctionField::kBrickEdge);
-        for (size_t i = 0; i < ExtinctionField::kBrickVertices; ++i) {
+        constexpr auto kEdge = static_cast<size_t>(DensityField::kBrickEdge);
+        for (size_t i = 0; i < DensityField::kBrickVertices; ++i) {
             for (size_t c = 0; c < field.channels(); ++c) {
                 if (field.vertex(entry, i, c) > 0) {
                     const Int3 at{{lo[0] + static_cast<int64_t>(i / (kEdge * kEdge)),

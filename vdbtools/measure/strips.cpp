@@ -1,8 +1,8 @@
 // SPDX-License-Identifier: Apache-2.0
 #include "strips.h"
 
-#include "camera.h"
-#include "transmittance.h"
+#include "query/transmittance.h"
+#include "view/camera.h"
 
 #include <array>
 #include <cfloat>

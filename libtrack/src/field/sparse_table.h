@@ -3,8 +3,8 @@
 // (whose items are bricks of 8^3 voxels) and the super-voxels (items of N^3 voxels) live in one.
 #pragma once
 
-#include "geometry.h"
 #include "hash.h"
+#include "space/local_ray.h"
 
 #include <array>
 #include <bitset>
@@ -14,17 +14,6 @@
 #include <vector>
 
 namespace trk {
-
-/// A ray in local space (voxels, relative to the volume's anchor), clipped and re-origined: it
-/// starts at t = 0 inside the volume's box. `direction` has unit length, so t counts voxels.
-struct LocalRay {
-    Vec3d origin;
-    Vec3d direction;
-    Vec3d inverse;  ///< 1 / direction; huge where that is 0, so that its planes are never next
-    double tEnd = 0;
-
-    Vec3d at(double t) const { return origin + t * direction; }
-};
 
 /// Maps integer points to 32-bit entries: a dense root box over nodes of 8^3 children, as deep as
 /// the extent asks for. An entry above item level is a tile: it stands for its whole region. What

@@ -2,12 +2,12 @@
 #include "transmittance.h"
 
 #include "batch.h"
-#include "estimators/exact.h"
-#include "estimators/free_path.h"
-#include "estimators/ratio_tracking.h"
-#include "estimators/ray_marching.h"
+#include "estimate/exact.h"
+#include "estimate/free_path.h"
+#include "estimate/ratio_tracking.h"
+#include "estimate/ray_marching.h"
+#include "estimate/rng.h"
 #include "failure.h"
-#include "rng.h"
 #include "variant.h"
 
 #include <algorithm>

@@ -2,7 +2,7 @@
 #include "known_error.h"
 
 #include "predicted_variance.h"
-#include "transmittance.h"
+#include "query/transmittance.h"
 
 #include <algorithm>
 #include <cmath>

@@ -2,7 +2,7 @@
 // What each choice of the control leaves to chance, as pictures of a camera's view.
 #pragma once
 
-#include "super_voxels.h"
+#include "control/super_voxels.h"
 #include "sweep.h"
 #include "track/track.h"
 

@@ -2,7 +2,7 @@
 // A way to estimate transmittance: a method with all it depends on.
 #pragma once
 
-#include "control_shape.h"
+#include "control/control_shape.h"
 #include "track/track.h"
 
 #include <string>

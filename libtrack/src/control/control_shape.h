@@ -2,7 +2,7 @@
 // The kinds of control and how each varies inside its super-voxel.
 #pragma once
 
-#include "geometry.h"
+#include "space/geometry.h"
 
 #include <algorithm>
 #include <array>

@@ -3,10 +3,10 @@
 // are described in libtrack/docs/measure.md.
 #pragma once
 
+#include "measure/recommendation.h"
+#include "measure/strips.h"
+#include "measure/sweep.h"
 #include "path_tracer.h"
-#include "recommendation.h"
-#include "strips.h"
-#include "sweep.h"
 
 #include <optional>
 #include <string>

@@ -2,7 +2,7 @@
 // What the random walks share: how they are set, what they spent, when they had better integrate.
 #pragma once
 
-#include "../sparse_table.h"
+#include "field/sparse_table.h"
 
 #include <cmath>
 #include <cstdint>

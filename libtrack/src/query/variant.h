@@ -3,7 +3,7 @@
 // a grey volume with a constant control pays for neither.
 #pragma once
 
-#include "super_voxels.h"
+#include "control/super_voxels.h"
 #include "volume.h"
 
 #include <array>

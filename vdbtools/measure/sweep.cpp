@@ -1,13 +1,13 @@
 // SPDX-License-Identifier: Apache-2.0
 #include "sweep.h"
 
-#include "estimators/ratio_tracking.h"
+#include "estimate/ratio_tracking.h"
 #include "failure.h"
 #include "io/sidecar.h"
 #include "parallel.h"
 #include "predicted_variance.h"
+#include "query/transmittance.h"
 #include "sweep_rays.h"
-#include "transmittance.h"
 
 #include <sched.h>
 

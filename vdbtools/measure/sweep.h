@@ -19,7 +19,7 @@ namespace vdbtools {
 /// A density that volumes of many extinctions are made over.
 struct Source {
     trk::DensitySummary summary;
-    std::shared_ptr<const trk::ExtinctionField> field;
+    std::shared_ptr<const trk::DensityField> field;
 };
 
 enum class RayKind {

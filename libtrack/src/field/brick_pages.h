@@ -3,7 +3,7 @@
 // or of a field too large for memory read from its source again, a page at a time.
 #pragma once
 
-#include "extinction_field.h"
+#include "density_field.h"
 #include "parallel.h"
 #include "raw_array.h"
 
@@ -34,7 +34,7 @@ class BrickLoader {
     /// What the page has so far.
     virtual size_t slots() const = 0;
     virtual size_t slotOf(Entry brick) const = 0;
-    /// Reads the page, slot after slot as ExtinctionField has its bricks. Throws Error.
+    /// Reads the page, slot after slot as DensityField has its bricks. Throws Error.
     virtual void load(RawArray<float>& page) = 0;
 };
 
@@ -43,13 +43,13 @@ class BrickPages {
     using Entry = SparseTable::Entry;
 
     /// Of a field that holds its bricks.
-    BrickPages(const ExtinctionField& field) : field_(field) {}
+    BrickPages(const DensityField& field) : field_(field) {}
     /// Of one that does not; `pageBytes`: what a page may take;
     /// what one thing to be done needs, it gets.
-    BrickPages(const ExtinctionField& field, BrickLoader& loader, uint64_t pageBytes)
+    BrickPages(const DensityField& field, BrickLoader& loader, uint64_t pageBytes)
         : field_(field), loader_(&loader), mostSlots_(pageBytes / brickBytes()) {}
 
-    const ExtinctionField& field() const { return field_; }
+    const DensityField& field() const { return field_; }
     bool resident() const { return !loader_; }
     /// Memory of all there is, and of a page.
     uint64_t bytes() const {
@@ -79,7 +79,7 @@ class BrickPages {
             size_t end = begin;
             do {
                 bricksOf(end++, [&](Entry entry) {
-                    if (!ExtinctionField::isConstant(entry)) {
+                    if (!DensityField::isConstant(entry)) {
                         loader_->want(entry);
                     }
                 });
@@ -94,9 +94,9 @@ class BrickPages {
         }
     }
 
-    /// One channel of a brick that is at hand, as ExtinctionField has it.
+    /// One channel of a brick that is at hand, as DensityField has it.
     const float* brickChannel(Entry brick, size_t channel,
-                              float (&buffer)[ExtinctionField::kBrickVertices]) const {
+                              float (&buffer)[DensityField::kBrickVertices]) const {
         if (!loader_) {
             return field_.brickChannel(brick, channel, buffer);
         }
@@ -104,7 +104,7 @@ class BrickPages {
         if (field_.channels() == 1) {
             return from;
         }
-        for (size_t i = 0; i < ExtinctionField::kBrickVertices; ++i) {
+        for (size_t i = 0; i < DensityField::kBrickVertices; ++i) {
             buffer[i] = from[i * field_.channels() + channel];
         }
         return buffer;
@@ -116,21 +116,21 @@ class BrickPages {
     std::array<double, C> integrate(Entry entry, const Int3& lo, const LocalRay& ray, double t0,
                                     double t1) const {
         uint64_t cells = 0;
-        return loader_ && !ExtinctionField::isConstant(entry)
-                   ? ExtinctionField::integrateBrick<C>(pageBrick(entry), lo, ray, t0, t1, cells)
+        return loader_ && !DensityField::isConstant(entry)
+                   ? DensityField::integrateBrick<C>(pageBrick(entry), lo, ray, t0, t1, cells)
                    : field_.integrateRegion<C>(entry, lo, ray, t0, t1, cells);
     }
 
   private:
     size_t brickBytes() const {
-        return ExtinctionField::kBrickVertices * field_.channels() * sizeof(float);
+        return DensityField::kBrickVertices * field_.channels() * sizeof(float);
     }
     const float* pageBrick(Entry brick) const {
         return page_.data() +
-               loader_->slotOf(brick) * ExtinctionField::kBrickVertices * field_.channels();
+               loader_->slotOf(brick) * DensityField::kBrickVertices * field_.channels();
     }
 
-    const ExtinctionField& field_;
+    const DensityField& field_;
     BrickLoader* loader_ = nullptr;
     size_t mostSlots_ = 0;
     RawArray<float> page_;

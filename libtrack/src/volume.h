@@ -112,6 +112,9 @@ class VolumeExtinction {
     std::array<double, C> extinction(const Vec3d& point) const {
         return scaled(field_.density<F>(point));
     }
+    /// As DensityField's.
+    void prefetchEntry(const Vec3d& point) const { field_.prefetchEntry(point); }
+    void prefetchBrick(const Vec3d& point) const { field_.prefetchBrick(point); }
     /// Over [t0, t1] of the ray, times the length of a voxel.
     std::array<double, C> integrate(const LocalRay& ray, double t0, double t1, uint64_t& lookups,
                                     uint64_t& regions) const {

@@ -241,7 +241,8 @@ TEST(Api, IntervalsThatAbutMultiply) {
         parts[1].tMax = parts[2].tMin = 21.0f;
         double sum[3];
         volume.integrateOpticalDepth(query, parts, 3, sum);
-        EXPECT_NEAR(sum[0] + sum[1] + sum[2], whole, 1e-9 * whole + 1e-12);
+        // Cells are interpolated in float, at other points where an interval is another.
+        EXPECT_NEAR(sum[0] + sum[1] + sum[2], whole, 2e-7 * whole + 1e-12);
         // Reversed, from the far end, with a direction that is not of unit length.
         TrkRay back = ray;
         for (int a = 0; a < 3; ++a) {

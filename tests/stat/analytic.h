@@ -8,6 +8,7 @@
 
 #include <array>
 #include <cstdint>
+#include <utility>
 
 namespace analytic {
 
@@ -38,6 +39,8 @@ struct Ramp {
     void forEachRegion(const LocalRay&, double t0, double t1, Visit&& visit) const {
         visit(static_cast<const std::array<double, 1>*>(nullptr), t0, t1);
     }
+    void prefetchEntry(const Vec3d&) const {}
+    void prefetchBrick(const Vec3d&) const {}
     double depth() const { return 0.5 * length * (first + last); }
     /// Integral of (extinction - control)^2.
     double squares(double control) const {
@@ -53,13 +56,33 @@ struct Everywhere {
     SuperVoxel item;
     trk::ExtinctionRange range;
 
+    using View = trk::SuperVoxelView<1, trk::ControlKind::kConstant>;
+
+    View view() const { return {&item, &range, nullptr, {}, 1}; }
     template <class Visit>
     void walk(const LocalRay& ray, double, double, Visit&& visit) const {
-        const trk::Int3 anywhere{{0, 0, 0}};
-        visit(trk::SuperVoxelView<1, trk::ControlKind::kConstant>(&item, &range, nullptr, anywhere,
-                                                                  1),
-              0.0, ray.tEnd);
+        visit(view(), 0.0, ray.tEnd);
     }
+
+    /// As trk::SuperVoxelCursor.
+    class Cursor {
+      public:
+        using View = Everywhere::View;
+
+        Cursor(const Everywhere& everywhere, double t1) : everywhere_(everywhere), t1_(t1) {}
+        bool next(View& view, double& tEnter, double& tExit) {
+            view = everywhere_.view();
+            tEnter = 0;
+            tExit = t1_;
+            return !std::exchange(done_, true);
+        }
+
+      private:
+        const Everywhere& everywhere_;
+        double t1_;
+        bool done_ = false;
+    };
+    Cursor cursor(const LocalRay&, double, double t1) const { return {*this, t1}; }
 };
 
 struct Measured {

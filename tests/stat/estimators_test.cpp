@@ -216,17 +216,28 @@ struct LyingSuperVoxels {
         std::memcpy(&bits, &v.baked, sizeof(bits));
         return v.bound > 0 && (bits >> 3 & 7) == 0;
     }
-    template <class Visit>
-    void walk(const LocalRay& ray, double t0, double t1, Visit&& visit) const {
-        Grey::Walk{truth}.walk(ray, t0, t1, [&](const auto& v, double tEnter, double tExit) {
-            trk::SuperVoxel item = v[0];
-            item.bound = lies(item) ? 0 : item.bound;
-            const trk::Int3 anywhere{{0, 0, 0}};  // a constant control is the same everywhere
-            const trk::SuperVoxelView<1, ControlKind::kConstant> view(&item, nullptr, nullptr,
-                                                                      anywhere, 1);
-            return visit(view, tEnter, tExit);
-        });
-    }
+    class Cursor {
+      public:
+        using View = trk::SuperVoxelView<1, ControlKind::kConstant>;
+
+        Cursor(const trk::SuperVoxels& truth, const LocalRay& ray, double t0, double t1)
+            : truth_(truth, ray, t0, t1) {}
+        bool next(View& view, double& tEnter, double& tExit) {
+            View v;
+            if (!truth_.next(v, tEnter, tExit)) {
+                return false;
+            }
+            item_ = v[0];
+            item_.bound = lies(item_) ? 0 : item_.bound;
+            view = View(&item_, nullptr, nullptr, {}, 1);  // constant: the same everywhere
+            return true;
+        }
+
+      private:
+        trk::SuperVoxelCursor<1, ControlKind::kConstant> truth_;
+        trk::SuperVoxel item_{};
+    };
+    Cursor cursor(const LocalRay& ray, double t0, double t1) const { return {truth, ray, t0, t1}; }
 };
 
 TEST(Estimators, ABoundOfZeroWhereThereIsResidualIsRejected) {

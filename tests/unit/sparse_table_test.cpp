@@ -1,11 +1,14 @@
 // SPDX-License-Identifier: Apache-2.0
-#include "field/sparse_table.h"
+#include "field/table_cursor.h"
 
 #include <gtest/gtest.h>
 
+#include <algorithm>
+#include <cmath>
 #include <map>
 #include <random>
 #include <set>
+#include <vector>
 
 namespace {
 
@@ -114,6 +117,99 @@ TEST(SparseTable, FullTableCoversTheWholeInterval) {
             }
         }
         EXPECT_NEAR(met.back().t1, ray.tEnd, 1e-9);
+    }
+}
+
+/// Nodes below nodes, links, tiles and empty regions of all sizes: items at random, in clusters and
+/// alone, and boxes.
+SparseTable deepTable(int64_t size, uint64_t seed) {
+    SparseTable table(3, cube(size));
+    std::mt19937_64 random(seed);
+    std::uniform_int_distribution<int64_t> place(0, size / 8 - 1);
+    std::set<Int3> items;
+    for (int cluster = 0; cluster < 40; ++cluster) {
+        const Int3 at{{place(random), place(random), place(random)}};
+        const int count = cluster % 2 == 0 ? 1 : 400;
+        for (int i = 0; i < count; ++i) {
+            Int3 item = at;
+            for (int64_t& x : item) {
+                x = std::min(x + static_cast<int64_t>(random() % 16), size / 8 - 1);
+            }
+            items.insert(item);
+        }
+    }
+    std::vector<SparseTable::Place> places;
+    const IntBox box{{{size / 2, size / 4, 64}}, {{size / 2 + 1032, size / 4 + 512, 1064}}};
+    table.addBox(box, 7, places);
+    for (const Int3& item : items) {
+        const Int3 lo{{8 * item[0], 8 * item[1], 8 * item[2]}};
+        bool inside = true;
+        for (size_t a = 0; a < 3; ++a) {
+            inside = inside && lo[a] >= box.lo[a] && lo[a] < box.hi[a];
+        }
+        if (!inside) {
+            places.push_back({lo, 3, static_cast<SparseTable::Entry>(1 + random() % 1000)});
+        }
+    }
+    table.assemble(places);
+    return table;
+}
+
+TEST(SparseTable, AWalkMeetsJustWhatIsFoundPointByPoint) {
+    std::mt19937_64 random(5);
+    for (const int64_t size : {256, 2048, 40000}) {
+        const SparseTable table = deepTable(size, static_cast<uint64_t>(size));
+        std::vector<Vec3d> targets;
+        table.forEach([&](const Int3& lo, int, SparseTable::Entry) {
+            targets.push_back({{static_cast<double>(lo[0]) + 4, static_cast<double>(lo[1]) + 4,
+                                static_cast<double>(lo[2]) + 4}});
+        });
+        std::uniform_real_distribution<double> unit(0, static_cast<double>(size));
+        size_t met = 0;
+        for (int i = 0; i < 400; ++i) {
+            // Through something, from the box's edge or from inside; every fourth along an axis.
+            const Vec3d b = targets[random() % targets.size()];
+            Vec3d a{{unit(random), unit(random), unit(random)}};
+            if (i % 4 == 0) {
+                a = b;
+                a[i / 4 % 3] = i % 8 == 0 ? 0 : static_cast<double>(size);
+            }
+            const LocalRay ray = makeRay(a, b - a, 1.01 * length(b - a));
+            const auto crossed = segments(table, ray);
+            ASSERT_FALSE(crossed.empty());
+            const auto find = [&](double t) {
+                const Vec3d p = ray.at(t);
+                return table.find(static_cast<int64_t>(std::floor(p[0])),
+                                  static_cast<int64_t>(std::floor(p[1])),
+                                  static_cast<int64_t>(std::floor(p[2])));
+            };
+            double last = 0;
+            for (const Segment& s : crossed) {
+                ASSERT_LE(last, s.t0);
+                ASSERT_LT(s.t0, s.t1);
+                if (s.t1 - s.t0 > 1e-9) {
+                    const auto found = find(0.5 * (s.t0 + s.t1));
+                    ASSERT_EQ(found.entry, s.entry);
+                    ASSERT_EQ(found.shift, s.shift);
+                }
+                if (s.t0 - last > 1e-9) {
+                    ASSERT_EQ(find(0.5 * (s.t0 + last)).entry, SparseTable::kEmpty);
+                }
+                last = s.t1;
+                ++met;
+            }
+            if (ray.tEnd - last > 1e-9) {
+                ASSERT_EQ(find(0.5 * (ray.tEnd + last)).entry, SparseTable::kEmpty);
+            }
+            for (int k = 0; k < 200; ++k) {  // what is found between is met
+                const double t = ray.tEnd * (k + 0.5) / 200;
+                const bool inside = std::any_of(
+                    crossed.begin(), crossed.end(),
+                    [&](const Segment& s) { return s.t0 - 1e-9 <= t && t <= s.t1 + 1e-9; });
+                ASSERT_TRUE(inside || find(t).entry == SparseTable::kEmpty);
+            }
+        }
+        EXPECT_GT(met, 2000u);
     }
 }
 

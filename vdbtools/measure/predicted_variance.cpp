@@ -56,7 +56,7 @@ double expectedLookups(double rate, const trk::TrackingSettings& settings, doubl
 }
 /// Beyond which a super-voxel is integrated exactly.
 double mostLookups(const trk::TrackingSettings& settings, const trk::LocalRay& ray, double voxels) {
-    return settings.exactFallback ? trk::exactCost(ray, voxels) : trk::kMostLookups;
+    return settings.exactFallback ? trk::ExactCost(ray)(voxels) : trk::kMostLookups;
 }
 
 template <class V, class Method>
@@ -69,8 +69,8 @@ PredictedCost costOf(const Volume& volume, const TrkQuery& query, const trk::Cli
             const double lookups =
                 expectedLookups(rateOf<V::kChannels, Method>(v, settings), settings, t1 - t0);
             const bool tracked = lookups <= mostLookups(settings, ray, t1 - t0);
-            cost.estimate += tracked ? lookups : trk::exactCost(ray, t1 - t0);
-            cost.exact += trk::exactCost(ray, t1 - t0);
+            cost.estimate += tracked ? lookups : trk::ExactCost(ray)(t1 - t0);
+            cost.exact += trk::ExactCost(ray)(t1 - t0);
             return true;
         });
     return cost;

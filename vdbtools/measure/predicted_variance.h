@@ -16,7 +16,7 @@ std::array<double, 3> predictVariance(const trk::Volume& volume, const TrkQuery&
                                       const TrkRay& ray);
 
 /// What an estimate of such a method costs, and what integrating the whole ray exactly does, in
-/// random look-ups (see exactCost in estimate/tracking.h); of delta tracking, at most.
+/// random look-ups (see ExactCost in estimate/tracking.h); of delta tracking, at most.
 struct PredictedCost {
     double estimate = 0;
     double exact = 0;

@@ -3,7 +3,7 @@
 #pragma once
 
 #include "control_shape.h"
-#include "field/sparse_table.h"
+#include "field/table_cursor.h"
 #include "track/track.h"
 
 #include <algorithm>
@@ -105,8 +105,9 @@ struct ExtinctionRange {
 template <size_t C, ControlKind K>
 class SuperVoxelView {
   public:
+    SuperVoxelView() = default;
     SuperVoxelView(const SuperVoxel* items, const ExtinctionRange* ranges, const float* shapes,
-                   const Int3& lo, double inverseSize)
+                   const Vec3d& lo, double inverseSize)
         : items_(items), ranges_(ranges), shapes_(shapes), lo_(lo), inverseSize_(inverseSize) {}
 
     const SuperVoxel& operator[](size_t channel) const { return items_[channel]; }
@@ -153,8 +154,7 @@ class SuperVoxelView {
     Vec3d toUnit(const Vec3d& point) const {
         Vec3d u;
         for (int a = 0; a < 3; ++a) {
-            u[a] =
-                (point[a] - static_cast<double>(lo_[static_cast<size_t>(a)])) * inverseSize_ - 0.5;
+            u[a] = (point[a] - lo_[a]) * inverseSize_ - 0.5;
         }
         return u;
     }
@@ -173,12 +173,15 @@ class SuperVoxelView {
         }
     }
 
-    const SuperVoxel* items_;
-    const ExtinctionRange* ranges_;
-    const float* shapes_;
-    const Int3& lo_;
-    double inverseSize_;
+    const SuperVoxel* items_ = nullptr;
+    const ExtinctionRange* ranges_ = nullptr;
+    const float* shapes_ = nullptr;
+    Vec3d lo_;
+    double inverseSize_ = 1;
 };
+
+template <size_t C, ControlKind K>
+class SuperVoxelCursor;
 
 /// The super-voxels of an opened volume, of as many channels as its extinction has. Immutable.
 class SuperVoxels {
@@ -203,18 +206,7 @@ class SuperVoxels {
     /// C: the volume's channels; K: its kind of control, or kConstant where only what a view says
     /// without a point is asked.
     template <size_t C, ControlKind K, class Visit>
-    void walk(const LocalRay& ray, double t0, double t1, Visit&& visit) const {
-        const double inverseSize = std::ldexp(1.0, -table_.itemShift());
-        table_.walk(
-            ray, t0, t1,
-            [&](SparseTable::Entry entry, const Int3& lo, int, double tEnter, double tExit) {
-                const size_t item = SparseTable::index(entry) * C;
-                using View = SuperVoxelView<C, K>;
-                return visit(View(&items_[item], &ranges_[item],
-                                  shapes_.data() + item * View::kStride, lo, inverseSize),
-                             tEnter, tExit);
-            });
-    }
+    void walk(const LocalRay& ray, double t0, double t1, Visit&& visit) const;
 
     /// Integral of the baked control extinction of a level over the ray, times the length of a
     /// voxel. Level 0 is the baked grid.
@@ -261,6 +253,9 @@ class SuperVoxels {
                               double diagonal);
 
   private:
+    template <size_t C, ControlKind K>
+    friend class SuperVoxelCursor;
+
     SparseTable table_;
     ControlKind kind_ = ControlKind::kConstant;
     std::vector<SuperVoxel> items_;
@@ -269,5 +264,71 @@ class SuperVoxels {
     std::vector<ValueTable> levels_;       // in extinction
     std::vector<IntBox> boxes_{IntBox{}};  // one a level, from 0
 };
+
+/// The super-voxels on a ray's way, in order; may stop anywhere and go on. A few are found at a
+/// time, so that what is baked of them is on its way from memory when they are asked for.
+template <size_t C, ControlKind K>
+class SuperVoxelCursor {
+  public:
+    using View = SuperVoxelView<C, K>;
+
+    SuperVoxelCursor(const SuperVoxels& superVoxels, const LocalRay& ray, double t0, double t1)
+        : superVoxels_(superVoxels),
+          table_(superVoxels.table_, ray, t0, t1),
+          inverseSize_(std::ldexp(1.0, -superVoxels.table_.itemShift())) {}
+
+    bool next(View& view, double& tEnter, double& tExit) {
+        if (taken_ == found_) {
+            find();
+            if (found_ == 0) {
+                return false;
+            }
+        }
+        const Crossing& crossing = crossings_[taken_++];
+        const size_t item = SparseTable::index(crossing.entry) * C;
+        view = View(&superVoxels_.items_[item], &superVoxels_.ranges_[item],
+                    superVoxels_.shapes_.data() + item * View::kStride, crossing.lo, inverseSize_);
+        tEnter = crossing.tEnter;
+        tExit = crossing.tExit;
+        return true;
+    }
+
+  private:
+    static constexpr size_t kAhead = 8;
+
+    void find() {
+        taken_ = found_ = 0;
+        constexpr bool kIsPlaced = K != ControlKind::kConstant;
+        while (found_ < kAhead && table_.template next<kIsPlaced>(crossings_[found_])) {
+            const size_t item = SparseTable::index(crossings_[found_++].entry) * C;
+            __builtin_prefetch(&superVoxels_.items_[item]);
+            if constexpr (K == ControlKind::kConstant) {
+                __builtin_prefetch(&superVoxels_.ranges_[item]);
+            } else {
+                __builtin_prefetch(superVoxels_.shapes_.data() + item * View::kStride);
+            }
+        }
+    }
+
+    const SuperVoxels& superVoxels_;
+    TableCursor table_;
+    double inverseSize_;
+    size_t taken_ = 0;
+    size_t found_ = 0;
+    Crossing crossings_[kAhead];
+};
+
+template <size_t C, ControlKind K, class Visit>
+void SuperVoxels::walk(const LocalRay& ray, double t0, double t1, Visit&& visit) const {
+    SuperVoxelCursor<C, K> cursor(*this, ray, t0, t1);
+    SuperVoxelView<C, K> view;
+    double tEnter = 0;
+    double tExit = 0;
+    while (cursor.next(view, tEnter, tExit)) {
+        if (!visit(view, tEnter, tExit)) {
+            return;
+        }
+    }
+}
 
 }  // namespace trk

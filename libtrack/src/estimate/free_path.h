@@ -197,7 +197,7 @@ FreePath<Field::kChannels> sampleFreePath(const Field& field, const SuperVoxels&
         // Where a ray meets little of what the rate covers, null collisions would never end. After
         // as many as integrating exactly takes, that is what is done with the rest: having come so
         // far, how to go on is free.
-        double budget = settings.exactFallback ? exactCost(ray, voxels) : kMostLookups;
+        double budget = settings.exactFallback ? ExactCost(ray)(voxels) : kMostLookups;
         double remaining = ratePerVoxel * voxels;
         cost.random = cost.random || remaining > 0;
         while (distance < remaining) {

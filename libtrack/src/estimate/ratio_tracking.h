@@ -9,6 +9,7 @@
 #include <array>
 #include <cmath>
 #include <cstddef>
+#include <utility>
 
 namespace trk {
 
@@ -82,14 +83,23 @@ class Throughput {
         return std::all_of(products_.begin(), products_.end(),
                            [](const ScaledProduct& p) { return p.isZero(); });
     }
+    /// Whether any product is large enough for roulette to leave it alone, by what is known without
+    /// an exponential.
+    bool matters() const {
+        bool any = false;
+        for (size_t c = 0; c < C; ++c) {
+            any = any || opticalDepth_[c] < limits_[c];
+        }
+        return any;
+    }
     /// Whether the walk goes on. Sets `isRandom` where that was left to chance.
     template <class Random>
     bool survives(Random& random, bool& isRandom) {
+        if (matters()) {
+            return true;
+        }
         double largest = 0;
         for (size_t c = 0; c < C; ++c) {
-            if (opticalDepth_[c] < limits_[c]) {
-                return true;
-            }
             largest = std::max(largest, std::fabs(value(c)));
         }
         const double probability = largest / kRouletteThreshold;
@@ -116,73 +126,190 @@ class Throughput {
 ///   exp(-integral of control) x product over collisions of (1 - (extinction - control) / rate),
 /// collisions at `rate` per world length [Novak14, Eq. 4]. Unbiased for any rate > 0 wherever the
 /// residual is not 0. All channels go one walk, whose rate covers the largest of their bounds, and
-/// each carries its own weight. `superVoxels.walk(ray, t0, t1, visit)` yields the segments,
-/// `field.extinction` and `field.integrate` the extinction of Field::kChannels channels.
+/// each carries its own weight.
+///
+/// Where collisions are does not depend on what is found there. So a walk goes by chunks: advance()
+/// crosses super-voxels and draws collisions, prefetch() and weigh() look them up, and only then
+/// roulette judges the weights. Between these steps other rays may take theirs, while memory
+/// answers.
+///
+/// `superVoxels.cursor(ray, t0, t1)` yields the segments, `field.extinction` and `field.integrate`
+/// the extinction of Field::kChannels channels. All arguments must live as long.
+template <class Method, class Field, class SuperVoxels, class Random>
+class RatioWalk {
+  public:
+    static constexpr size_t C = Field::kChannels;
+
+    RatioWalk(const Field& field, const SuperVoxels& superVoxels, const LocalRay& ray,
+              const TrackingSettings& settings, Random& random, PathCost& cost)
+        : field_(field),
+          ray_(ray),
+          settings_(settings),
+          random_(random),
+          cost_(cost),
+          exactCost_(ray),
+          cursor_(superVoxels.cursor(ray, 0, ray.tEnd)),
+          distance_(random.exponential()) {}
+
+    /// Up to the next few collisions; false where there are none left.
+    bool advance() {
+        count_ = 0;
+        while (count_ < kChunk) {
+            if (!isInside_) {
+                if (!hasNext_ && !cursor_.next(superVoxel_, tEnter_, tExit_)) {
+                    break;
+                }
+                hasNext_ = true;
+                if (!enter()) {
+                    break;
+                }
+            }
+            while (isInside_ && count_ < kChunk) {
+                collideOrLeave();
+            }
+        }
+        return count_ > 0;
+    }
+
+    /// Of the collisions that were drawn: asks memory for them.
+    void prefetch() const {
+        for (size_t i = 0; i < count_; ++i) {
+            field_.prefetchBrick(collisions_[i].point);
+        }
+    }
+
+    /// Looks the collisions up; false where the walk has ended.
+    bool weigh() {
+        for (size_t i = 0; i < count_; ++i) {
+            const Collision& collision = collisions_[i];
+            const auto extinction = field_.extinction(collision.point);
+            for (size_t c = 0; c < C; ++c) {
+                // A channel without residual there keeps its weight to the bit.
+                if (C == 1 || collision.isTracked[c]) {
+                    sofar_.multiply(c, 1 - (extinction[c] - collision.control[c]) / collision.rate);
+                }
+            }
+        }
+        cost_.lookups += count_;
+        // The control of the super-voxel that the walk is in is not in the throughput yet: it may
+        // still be needed to outweigh collisions that amplify.
+        return settings_.roulette ? sofar_.survives(random_, cost_.random) : !sofar_.isZero();
+    }
+
+    std::array<double, C> result() const {
+        std::array<double, C> values;
+        for (size_t c = 0; c < C; ++c) {
+            values[c] = sofar_.value(c);
+        }
+        return values;
+    }
+
+  private:
+    static constexpr size_t kChunk = 4;
+
+    struct Collision {
+        Vec3d point;
+        double rate;
+        std::array<double, C> control;
+        std::array<bool, C> isTracked;
+    };
+    using Cursor = decltype(std::declval<const SuperVoxels&>().cursor(
+        std::declval<const LocalRay&>(), 0.0, 0.0));
+
+    /// Begins with the super-voxel at hand, unless what is left is to be weighed first, or to end.
+    bool enter() {
+        double base = Method::rate(superVoxel_, 0, settings_.rateBase);
+        for (size_t c = 1; c < C; ++c) {
+            base = std::max(base, Method::rate(superVoxel_, c, settings_.rateBase));
+        }
+        // Where the super-voxel is homogeneous, walks do not end.
+        if (settings_.roulette && base > 0 && !sofar_.matters()) {
+            if (count_ > 0) {
+                return false;
+            }
+            if (!sofar_.survives(random_, cost_.random)) {
+                return false;
+            }
+        }
+        hasNext_ = false;
+        ++cost_.superVoxels;
+        const double length = tExit_ - tEnter_;
+        rate_ = base * settings_.rate;
+        ratePerVoxel_ = rate_ * settings_.lengthPerVoxel;
+        remaining_ = ratePerVoxel_ * length;
+        if (remaining_ > (settings_.exactFallback ? exactCost_(length) : kMostLookups)) {
+            uint64_t bricks = 0;
+            const auto exact = field_.integrate(ray_, tEnter_, tExit_, cost_.lookups, bricks);
+            for (size_t c = 0; c < C; ++c) {
+                sofar_.integrate(c, settings_.lengthPerVoxel * exact[c]);
+            }
+            cost_.exactLength += length;
+            return true;
+        }
+        cost_.random = cost_.random || remaining_ > 0;
+        isInside_ = true;
+        return true;
+    }
+
+    /// To the next collision, or out of the super-voxel. What is left of the optical distance (in
+    /// units of the rate) is carried over from one super-voxel to the next, as the exponential
+    /// distribution has no memory: one logarithm a look-up, none where there is none.
+    void collideOrLeave() {
+        if (distance_ < remaining_) {
+            remaining_ -= distance_;
+            distance_ = random_.exponential();
+            Collision& collision = collisions_[count_++];
+            collision.point = ray_.at(tExit_ - remaining_ / ratePerVoxel_);
+            field_.prefetchEntry(collision.point);
+            collision.rate = rate_;
+            for (size_t c = 0; c < C; ++c) {
+                collision.control[c] = Method::control(superVoxel_, c, collision.point);
+                collision.isTracked[c] =
+                    C == 1 || Method::rate(superVoxel_, c, settings_.rateBase) > 0;
+            }
+            return;
+        }
+        distance_ -= remaining_;
+        isInside_ = false;
+        for (size_t c = 0; c < C; ++c) {
+            sofar_.integrate(c, settings_.lengthPerVoxel *
+                                    Method::integrate(superVoxel_, c, ray_, tEnter_, tExit_));
+        }
+    }
+
+    const Field& field_;
+    const LocalRay& ray_;
+    const TrackingSettings& settings_;
+    Random& random_;
+    PathCost& cost_;
+    ExactCost exactCost_;
+    Cursor cursor_;
+    Throughput<C> sofar_;
+    typename Cursor::View superVoxel_;  // at hand
+    double tEnter_ = 0;
+    double tExit_ = 0;
+    bool hasNext_ = false;   // it is not begun
+    bool isInside_ = false;  // it is not done
+    double rate_ = 0;        // a world length
+    double ratePerVoxel_ = 0;
+    double remaining_ = 0;  // optical distances: to its end
+    double distance_;       // and to the next collision
+    size_t count_ = 0;
+    Collision collisions_[kChunk];
+};
+
+/// The walk of one ray alone.
 template <class Method, class Field, class SuperVoxels, class Random>
 std::array<double, Field::kChannels> trackTransmittance(const Field& field,
                                                         const SuperVoxels& superVoxels,
                                                         const LocalRay& ray,
                                                         const TrackingSettings& settings,
                                                         Random& random, PathCost& cost) {
-    constexpr size_t C = Field::kChannels;
-    Throughput<C> sofar;
-    // Optical distance (in units of the rate) to the next collision; carried over from one
-    // super-voxel to the next, as the exponential distribution has no memory: one logarithm a
-    // look-up, none where there is none.
-    double distance = random.exponential();
-    superVoxels.walk(ray, 0, ray.tEnd, [&](const auto& v, double tEnter, double tExit) {
-        ++cost.superVoxels;
-        double base = Method::rate(v, 0, settings.rateBase);
-        for (size_t c = 1; c < C; ++c) {
-            base = std::max(base, Method::rate(v, c, settings.rateBase));
-        }
-        // Where the super-voxel is homogeneous, walks do not end.
-        if (settings.roulette && base > 0 && !sofar.survives(random, cost.random)) {
-            return false;
-        }
-        const double rate = base * settings.rate;
-        const double ratePerVoxel = rate * settings.lengthPerVoxel;
-        double remaining = ratePerVoxel * (tExit - tEnter);
-        if (remaining > (settings.exactFallback ? exactCost(ray, tExit - tEnter) : kMostLookups)) {
-            uint64_t bricks = 0;
-            const auto exact = field.integrate(ray, tEnter, tExit, cost.lookups, bricks);
-            for (size_t c = 0; c < C; ++c) {
-                sofar.integrate(c, settings.lengthPerVoxel * exact[c]);
-            }
-            cost.exactLength += tExit - tEnter;
-            return true;
-        }
-        cost.random = cost.random || remaining > 0;
-        while (distance < remaining) {
-            remaining -= distance;
-            const Vec3d point = ray.at(tExit - remaining / ratePerVoxel);
-            const auto extinction = field.extinction(point);
-            for (size_t c = 0; c < C; ++c) {
-                // A channel without residual here keeps its weight to the bit.
-                if (C == 1 || Method::rate(v, c, settings.rateBase) > 0) {
-                    sofar.multiply(c, 1 - (extinction[c] - Method::control(v, c, point)) / rate);
-                }
-            }
-            ++cost.lookups;
-            // This super-voxel's control is not in the throughput yet: it may still be needed to
-            // outweigh collisions that amplify.
-            if (settings.roulette ? !sofar.survives(random, cost.random) : sofar.isZero()) {
-                return false;
-            }
-            distance = random.exponential();
-        }
-        distance -= remaining;
-        for (size_t c = 0; c < C; ++c) {
-            sofar.integrate(c,
-                            settings.lengthPerVoxel * Method::integrate(v, c, ray, tEnter, tExit));
-        }
-        return true;
-    });
-    std::array<double, C> result;
-    for (size_t c = 0; c < C; ++c) {
-        result[c] = sofar.value(c);
+    RatioWalk<Method, Field, SuperVoxels, Random> walk(field, superVoxels, ray, settings, random,
+                                                       cost);
+    while (walk.advance() && walk.weigh()) {
     }
-    return result;
+    return walk.result();
 }
 
 }  // namespace trk

@@ -2,7 +2,7 @@
 // What the random walks share: how they are set, what they spent, when they had better integrate.
 #pragma once
 
-#include "field/sparse_table.h"
+#include "space/local_ray.h"
 
 #include <cmath>
 #include <cstdint>
@@ -33,11 +33,16 @@ struct TrackingSettings {
 /// How many random look-ups take as long as integrating voxel lengths exactly: half a one a cell,
 /// whose values lie side by side (measured; see method.md). Whether an estimate of transmittance
 /// takes more is decided from its expected number, not the drawn one, which would be bias.
-inline double exactCost(const LocalRay& ray, double voxels) {
-    const double cellsPerVoxel =
-        std::fabs(ray.direction[0]) + std::fabs(ray.direction[1]) + std::fabs(ray.direction[2]);
-    return 0.5 * (1 + cellsPerVoxel * voxels);
-}
+class ExactCost {
+  public:
+    explicit ExactCost(const LocalRay& ray)
+        : perVoxel_(0.5 * (std::fabs(ray.direction[0]) + std::fabs(ray.direction[1]) +
+                           std::fabs(ray.direction[2]))) {}
+    double operator()(double voxels) const { return 0.5 + perVoxel_ * voxels; }
+
+  private:
+    double perVoxel_;
+};
 
 /// More than this many look-ups in a super-voxel are never taken, whatever is asked for: the
 /// steps of a walk would drown in the rounding of what remains, and it would never end.

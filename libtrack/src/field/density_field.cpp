@@ -1,6 +1,10 @@
 // SPDX-License-Identifier: Apache-2.0
 #include "density_field.h"
 
+#include "kernel.h"
+#include "line_integral.h"
+#include "table_cursor.h"
+
 #include <utility>
 
 namespace trk {
@@ -19,21 +23,61 @@ size_t DensityField::bytes() const {
            halfs_.bytes();
 }
 
+namespace {
+
+template <size_t C, class Stored>
+std::array<double, C> integrateLine(const DensityField& field, const Stored* bricks,
+                                    const LocalRay& ray, double t0, double t1, uint64_t& lookups,
+                                    uint64_t& regions) {
+    LineIntegral<C, Stored> line(ray);
+    std::array<double, C> sum{};
+    TableCursor cursor(field.table(), ray, t0, t1);
+    Crossing crossing{};
+    uint64_t met = 0;
+    while (cursor.next(crossing)) {
+        ++met;
+        if (DensityField::isConstant(crossing.entry)) {
+            const float* constant = field.constant(crossing.entry);
+            for (size_t c = 0; c < C; ++c) {
+                sum[c] += static_cast<double>(constant[c]) * (crossing.tExit - crossing.tEnter);
+            }
+        } else {
+            line.add(bricks + (crossing.entry - 1) * DensityField::kBrickVertices * C, crossing.lo,
+                     crossing.tEnter, crossing.tExit);
+        }
+    }
+    const std::array<double, C> cells = line.sum();
+    for (size_t c = 0; c < C; ++c) {
+        sum[c] += cells[c];
+    }
+    regions += met;
+    lookups += 2 * line.cells();
+    return sum;
+}
+
+#ifdef TRACK_AVX2
+template <size_t C, class Stored>
+TRACK_AVX2 std::array<double, C> integrateLineAvx2(const DensityField& field, const Stored* bricks,
+                                                   const LocalRay& ray, double t0, double t1,
+                                                   uint64_t& lookups, uint64_t& regions) {
+    return integrateLine<C>(field, bricks, ray, t0, t1, lookups, regions);
+}
+#endif
+
+}  // namespace
+
 template <size_t C>
 std::array<double, C> DensityField::integrate(const LocalRay& ray, double t0, double t1,
                                               uint64_t& lookups, uint64_t& regions) const {
-    std::array<double, C> sum{};
-    table_.walk(ray, t0, t1, [&](Entry entry, const Int3& lo, int, double tEnter, double tExit) {
-        ++regions;
-        uint64_t cells = 0;
-        const std::array<double, C> part = integrateRegion<C>(entry, lo, ray, tEnter, tExit, cells);
-        lookups += 2 * cells;
-        for (size_t c = 0; c < C; ++c) {
-            sum[c] += part[c];
+    const auto run = [&](const auto* bricks) {
+#ifdef TRACK_AVX2
+        if (usesAvx2()) {
+            return integrateLineAvx2<C>(*this, bricks, ray, t0, t1, lookups, regions);
         }
-        return true;
-    });
-    return sum;
+#endif
+        return integrateLine<C>(*this, bricks, ray, t0, t1, lookups, regions);
+    };
+    return isHalf() ? run(halfs_.data()) : run(floats_.data());
 }
 
 template std::array<double, 1> DensityField::integrate<1>(const LocalRay&, double, double,

@@ -4,7 +4,7 @@
 #pragma once
 
 #include "raw_array.h"
-#include "sparse_table.h"
+#include "table_cursor.h"
 
 #include <algorithm>
 #include <array>
@@ -134,6 +134,30 @@ class DensityField {
         return buffer;
     }
 
+    /// Says that the density at a point will be asked for: first where its brick is, then, once
+    /// that has come, what is in it. Neither changes any result.
+    void prefetchEntry(const Vec3d& point) const {
+        table_.prefetch(static_cast<int64_t>(point[0]), static_cast<int64_t>(point[1]),
+                        static_cast<int64_t>(point[2]));
+    }
+    void prefetchBrick(const Vec3d& point) const {
+        const auto x = static_cast<int64_t>(point[0]);
+        const auto y = static_cast<int64_t>(point[1]);
+        const auto z = static_cast<int64_t>(point[2]);
+        const Entry entry = table_.find(x, y, z).entry;
+        if (isConstant(entry)) {
+            return;
+        }
+        const size_t at = ((entry - 1) * kBrickVertices + vertexOf(x, y, z)) * channels_;
+        const size_t bytes = channels_ * (isHalf() ? sizeof(uint16_t) : sizeof(float));
+        const char* first = isHalf() ? reinterpret_cast<const char*>(&halfs_[at])
+                                     : reinterpret_cast<const char*>(&floats_[at]);
+        __builtin_prefetch(first);
+        __builtin_prefetch(first + 10 * bytes);
+        __builtin_prefetch(first + 81 * bytes);
+        __builtin_prefetch(first + 91 * bytes);
+    }
+
     /// Density at a point of local space (its coordinates not negative).
     template <size_t C>
     std::array<float, C> density(const Vec3d& point) const {
@@ -146,10 +170,7 @@ class DensityField {
             std::copy_n(constant(entry), C, result.begin());
             return result;
         }
-        const size_t vertex =
-            (entry - 1) * kBrickVertices +
-            (static_cast<size_t>(x & 7) * kBrickEdge + static_cast<size_t>(y & 7)) * kBrickEdge +
-            static_cast<size_t>(z & 7);
+        const size_t vertex = (entry - 1) * kBrickVertices + vertexOf(x, y, z);
         const auto fx = static_cast<float>(point[0] - static_cast<double>(x));
         const auto fy = static_cast<float>(point[1] - static_cast<double>(y));
         const auto fz = static_cast<float>(point[2] - static_cast<double>(z));
@@ -225,6 +246,12 @@ class DensityField {
     }
 
   private:
+    /// The lower corner of a cell in its brick.
+    static size_t vertexOf(int64_t x, int64_t y, int64_t z) {
+        return (static_cast<size_t>(x & 7) * kBrickEdge + static_cast<size_t>(y & 7)) * kBrickEdge +
+               static_cast<size_t>(z & 7);
+    }
+
     /// One channel at the corners of a cell, of C that lie side by side.
     template <class Real, size_t C>
     struct Corners {

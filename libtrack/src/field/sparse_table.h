@@ -264,61 +264,20 @@ class SparseTable {
         return {entry, shift};
     }
 
+    /// Says that find will be asked for the entry at a point.
+    void prefetch(int64_t x, int64_t y, int64_t z) const {
+        const Found found = find(x, y, z, rootShift_);
+        if ((found.entry & kNodeFlag) && (found.entry & kLinkFlag) == 0) {
+            __builtin_prefetch(&nodes_[found.entry & kIndexMask][childIndex(
+                x >> (rootShift_ - 3), y >> (rootShift_ - 3), z >> (rootShift_ - 3))]);
+        }
+    }
+
     /// Calls `visit(entry, lo, shift, tEnter, tExit)` for every occupied region the ray meets in
     /// [t0, t1], in order, until it answers false. Regions abut: one's tExit is the next one's
     /// tEnter, both computed from the integer plane between them, and the last tExit is t1.
     template <class Visit>
-    void walk(const LocalRay& ray, double t0, double t1, Visit&& visit) const {
-        if (root_.empty()) {
-            return;
-        }
-        Int3 boxLo, boxHi, cell;
-        const Vec3d start = ray.at(t0);
-        for (size_t a = 0; a < 3; ++a) {
-            const int axis = static_cast<int>(a);
-            boxLo[a] = rootLo_[a] << rootShift_;
-            boxHi[a] = (rootLo_[a] + rootSize_[a]) << rootShift_;
-            cell[a] = clampCell(start[axis], boxLo[a], boxHi[a]);
-        }
-        for (double t = t0;;) {
-            const auto [entry, shift] = find(cell[0], cell[1], cell[2]);
-            const int64_t size = int64_t{1} << shift;
-            Int3 lo;
-            double tExit = t1;
-            size_t exitAxis = 3;
-            for (size_t a = 0; a < 3; ++a) {
-                const int axis = static_cast<int>(a);
-                lo[a] = (cell[a] >> shift) << shift;
-                const int64_t plane = ray.direction[axis] < 0 ? lo[a] : lo[a] + size;
-                const double tPlane =
-                    (static_cast<double>(plane) - ray.origin[axis]) * ray.inverse[axis];
-                if (tPlane < tExit) {
-                    tExit = tPlane;
-                    exitAxis = a;
-                }
-            }
-            tExit = std::max(tExit, t);
-            if (entry != kEmpty && tExit > t && !visit(entry, lo, shift, t, tExit)) {
-                return;
-            }
-            if (exitAxis == 3) {
-                return;
-            }
-            for (size_t a = 0; a < 3; ++a) {
-                const int axis = static_cast<int>(a);
-                if (a == exitAxis) {
-                    cell[a] = ray.direction[axis] < 0 ? lo[a] - 1 : lo[a] + size;
-                    if (cell[a] < boxLo[a] || cell[a] >= boxHi[a]) {
-                        return;
-                    }
-                } else {
-                    cell[a] = clampCell(ray.origin[axis] + tExit * ray.direction[axis], lo[a],
-                                        lo[a] + size);
-                }
-            }
-            t = tExit;
-        }
-    }
+    void walk(const LocalRay& ray, double t0, double t1, Visit&& visit) const;
 
     /// Calls `f(lo, shift, entry)` for every occupied item and tile.
     template <class F>
@@ -395,6 +354,8 @@ class SparseTable {
     }
 
   private:
+    friend class TableCursor;
+
     struct KeyHash {
         size_t operator()(const Key& key) const {
             return hashWords(key.data(), key.size() / 2, key.size() % 2 ? key.back() : 0);
@@ -621,11 +582,6 @@ class SparseTable {
                 markEntry(node[c], at, shift - 3, region, partShift, parts);
             }
         });
-    }
-
-    static int64_t clampCell(double x, int64_t lo, int64_t hi) {
-        // Points here are never negative but for rounding, so truncation is as good as floor.
-        return std::min(std::max(static_cast<int64_t>(x), lo), hi - 1);
     }
 
     template <class F>

@@ -64,19 +64,18 @@ void checkRays(const TrkQuery& query, const TrkRay* rays, size_t rayCount);
 void requireDensity(const Volume& volume, const char* instead);
 void requireSuperVoxels(const Volume& volume, const char* instead);
 
-/// Runs body(i) for every ray: in this thread for one ray or one thread, else over TBB.
+/// Runs body(begin, end) for parts of all rays: in this thread for one ray or one thread, else over
+/// TBB.
 template <class Body>
-void forEachRay(const TrkQuery& query, size_t rayCount, const Body& body) {
+void forEachRange(const TrkQuery& query, size_t rayCount, const Body& body) {
     if (rayCount == 1 || query.threads == 1) {
-        for (size_t i = 0; i < rayCount; ++i) {
-            body(i);
-        }
+        body(0, rayCount);
         return;
     }
     const auto run = [&] {
         // Isolated: a thread that waits here must not pick up a task of the caller's, who may hold
         // locks.
-        tbb::this_task_arena::isolate([&] { parallelFor(rayCount, 64, body); });
+        tbb::this_task_arena::isolate([&] { parallelRanges(rayCount, 64, body); });
     };
     if (query.threads == 0) {
         run();
@@ -85,6 +84,16 @@ void forEachRay(const TrkQuery& query, size_t rayCount, const Body& body) {
         const int most = tbb::this_task_arena::max_concurrency();
         tbb::task_arena(std::min(query.threads, most)).execute(run);
     }
+}
+
+/// Runs body(i) for every ray, in the same way.
+template <class Body>
+void forEachRay(const TrkQuery& query, size_t rayCount, const Body& body) {
+    forEachRange(query, rayCount, [&](size_t begin, size_t end) {
+        for (size_t i = begin; i != end; ++i) {
+            body(i);
+        }
+    });
 }
 
 }  // namespace trk

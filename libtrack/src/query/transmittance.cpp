@@ -8,12 +8,14 @@
 #include "estimate/ray_marching.h"
 #include "estimate/rng.h"
 #include "failure.h"
+#include "kernel.h"
 #include "variant.h"
 
 #include <algorithm>
 #include <array>
 #include <cmath>
 #include <limits>
+#include <optional>
 #include <string>
 
 namespace trk {
@@ -69,69 +71,62 @@ struct Estimate {
     std::array<double, C> standardError;
 };
 
-/// Of query.samples estimates, each what `estimateOnce(rng)` answers; it adds to `cost`.
-template <size_t C, class EstimateOnce>
-Estimate<C> averageSamples(const TrkQuery& query, uint64_t rayId, const PathCost& cost,
-                           const EstimateOnce& estimateOnce) {
-    Estimate<C> result{};
-    // Sums of squared deviations, updated without cancellation [Welford 1962].
-    std::array<double, C> squares{};
-    for (uint32_t i = 0; i < query.samples; ++i) {
-        Rng rng(query.seed, query.stream, rayId, i);
-        const std::array<double, C> estimate = estimateOnce(rng);
+/// The mean of several estimates of one ray.
+template <size_t C>
+class SampleMean {
+  public:
+    void add(const std::array<double, C>& estimate) {
+        ++count_;
         for (size_t c = 0; c < C; ++c) {
-            const double delta = estimate[c] - result.mean[c];
-            result.mean[c] += delta / (i + 1.0);
-            squares[c] += delta * (estimate[c] - result.mean[c]);
+            // Sums of squared deviations, updated without cancellation [Welford 1962].
+            const double delta = estimate[c] - mean_[c];
+            mean_[c] += delta / count_;
+            squares_[c] += delta * (estimate[c] - mean_[c]);
         }
     }
-    const double n = query.samples;
-    for (size_t c = 0; c < C; ++c) {
-        // That random estimates agree says little: only a larger number of them would differ.
-        result.standardError[c] = squares[c] > 0 ? std::sqrt(squares[c] / (n * (n - 1)))
-                                  : cost.random  ? kNaN
+    /// `isRandom`: another estimate might have been another one.
+    Estimate<C> result(bool isRandom) const {
+        Estimate<C> result{};
+        result.mean = mean_;
+        for (size_t c = 0; c < C; ++c) {
+            // That random estimates agree says little: only a larger number of them would differ.
+            result.standardError[c] = squares_[c] > 0
+                                          ? std::sqrt(squares_[c] / (count_ * (count_ - 1)))
+                                      : isRandom ? kNaN
                                                  : 0.0;
+        }
+        return result;
     }
-    return result;
-}
 
-/// Of a random method.
+  private:
+    double count_ = 0;
+    std::array<double, C> mean_{};
+    std::array<double, C> squares_{};
+};
+
+/// By a random method that takes one ray at a time.
 template <class V>
 Estimate<V::kChannels> estimateRandomly(const Volume& volume, const TrkQuery& query,
                                         const ClippedRay& clipped, uint64_t rayId, PathCost& cost) {
-    constexpr size_t C = V::kChannels;
     const TrackingSettings settings = trackingSettings(query, clipped.lengthPerVoxel);
     const LocalRay& ray = clipped.local;
     const typename V::Extinction extinction(volume);
     const typename V::Walk superVoxels{volume.tracked()};
-    const auto average = [&](const auto& estimateOnce) {
-        return averageSamples<C>(query, rayId, cost, estimateOnce);
-    };
-    switch (query.method) {
-        case TRK_METHOD_RESIDUAL:
-            return average([&](Rng& rng) {
-                return trackTransmittance<ResidualControl>(extinction, superVoxels, ray, settings,
-                                                           rng, cost);
-            });
-        case TRK_METHOD_RATIO:
-            return average([&](Rng& rng) {
-                return trackTransmittance<NoControl>(extinction, superVoxels, ray, settings, rng,
-                                                     cost);
-            });
-        case TRK_METHOD_DELTA:
-            return average([&](Rng& rng) {
-                return trackBinary(extinction, superVoxels, ray, settings, rng, cost);
-            });
-        default:  // TRK_METHOD_MARCH
-            return average([&](Rng& rng) {
-                auto result = marchOpticalDepth(extinction, ray, settings.lengthPerVoxel,
-                                                static_cast<double>(query.step), rng, cost);
-                for (double& value : result) {
-                    value = std::exp(-value);
-                }
-                return result;
-            });
+    SampleMean<V::kChannels> mean;
+    for (uint32_t i = 0; i < query.samples; ++i) {
+        Rng rng(query.seed, query.stream, rayId, i);
+        if (query.method == TRK_METHOD_DELTA) {
+            mean.add(trackBinary(extinction, superVoxels, ray, settings, rng, cost));
+            continue;
+        }
+        auto depth = marchOpticalDepth(extinction, ray, settings.lengthPerVoxel,
+                                       static_cast<double>(query.step), rng, cost);
+        for (double& value : depth) {
+            value = std::exp(-value);
+        }
+        mean.add(depth);
     }
+    return mean.result(cost.random);
 }
 
 float toFloat(double value) {
@@ -139,52 +134,191 @@ float toFloat(double value) {
     return static_cast<float>(std::fmin(std::fmax(value, -kLimit), kLimit));
 }
 
+/// What is written for one ray.
+template <class V>
+class RayOutput {
+  public:
+    RayOutput(const Volume& volume, const TrkQuery& query, const Array<float>& transmittance,
+              const StatisticsOutput& statistics)
+        : volume_(volume), query_(query), transmittance_(transmittance), statistics_(statistics) {}
+
+    /// `clippedLength`: voxel lengths within the volume; 0 where the ray misses it.
+    void write(size_t ray, Estimate<V::kChannels> estimate, const PathCost& cost,
+               double clippedLength, double samples) const {
+        const bool biased =
+            query_.method == TRK_METHOD_CONTROL || query_.method == TRK_METHOD_MARCH;
+        if (biased && clippedLength > 0) {
+            estimate.standardError.fill(kNaN);
+        }
+        for (size_t c = 0; c < V::kChannels; ++c) {
+            if (volume_.scales[c] == 0) {  // exactly 1, whatever the other channels met
+                estimate.standardError[c] = 0;
+            }
+        }
+        std::transform(estimate.mean.begin(), estimate.mean.end(), transmittance_.at(ray), toFloat);
+        if (statistics_.standardError) {
+            std::transform(estimate.standardError.begin(), estimate.standardError.end(),
+                           statistics_.standardError.at(ray), roundedError);
+        }
+        if (statistics_.lookups) {
+            *statistics_.lookups.at(ray) = cost.lookups;
+        }
+        if (statistics_.superVoxels) {
+            *statistics_.superVoxels.at(ray) = cost.superVoxels;
+        }
+        if (statistics_.exactShare) {
+            *statistics_.exactShare.at(ray) =
+                clippedLength > 0 ? static_cast<float>(cost.exactLength / (samples * clippedLength))
+                                  : 0.0f;
+        }
+    }
+    /// Of a ray that misses the volume, whatever the method.
+    void writeMiss(size_t ray) const {
+        Estimate<V::kChannels> estimate{};
+        estimate.mean.fill(1);
+        write(ray, estimate, {}, 0, 1);
+    }
+
+  private:
+    const Volume& volume_;
+    const TrkQuery& query_;
+    const Array<float>& transmittance_;
+    const StatisticsOutput& statistics_;
+};
+
+/// By any method but ratio tracking.
 template <class V>
 void estimateRay(const Volume& volume, const TrkQuery& query, const TrkRay& ray, size_t i,
-                 const Array<float>& transmittance, const StatisticsOutput& statistics) {
-    constexpr size_t C = V::kChannels;
+                 const RayOutput<V>& output) {
     PathCost cost;
-    double clippedLength = 0;
-    double samples = 1;
-    Estimate<C> estimate;
-    estimate.mean.fill(1);
-    estimate.standardError.fill(0);  // of a ray that misses the volume, whatever the method
     if (query.method == TRK_METHOD_EXACT || query.method == TRK_METHOD_CONTROL) {
+        double clippedLength = 0;
         const auto depth = deterministicDepth<V>(volume, query, ray, clippedLength, cost);
-        for (size_t c = 0; c < C; ++c) {
+        Estimate<V::kChannels> estimate{};
+        for (size_t c = 0; c < V::kChannels; ++c) {
             estimate.mean[c] = std::exp(-depth[c]);
         }
+        output.write(i, estimate, cost, clippedLength, 1);
     } else if (const auto clipped = volume.clip(ray, volume.field->box())) {
-        clippedLength = clipped->local.tEnd;
-        samples = query.samples;
-        estimate = estimateRandomly<V>(volume, query, *clipped, rayIdAt(query, i), cost);
-    }
-    const bool biased = query.method == TRK_METHOD_CONTROL || query.method == TRK_METHOD_MARCH;
-    if (biased && clippedLength > 0) {
-        estimate.standardError.fill(kNaN);
-    }
-    for (size_t c = 0; c < C; ++c) {
-        if (volume.scales[c] == 0) {  // exactly 1, whatever the other channels met
-            estimate.standardError[c] = 0;
-        }
-    }
-    std::transform(estimate.mean.begin(), estimate.mean.end(), transmittance.at(i), toFloat);
-    if (statistics.standardError) {
-        std::transform(estimate.standardError.begin(), estimate.standardError.end(),
-                       statistics.standardError.at(i), roundedError);
-    }
-    if (statistics.lookups) {
-        *statistics.lookups.at(i) = cost.lookups;
-    }
-    if (statistics.superVoxels) {
-        *statistics.superVoxels.at(i) = cost.superVoxels;
-    }
-    if (statistics.exactShare) {
-        *statistics.exactShare.at(i) =
-            clippedLength > 0 ? static_cast<float>(cost.exactLength / (samples * clippedLength))
-                              : 0.0f;
+        const auto estimate = estimateRandomly<V>(volume, query, *clipped, rayIdAt(query, i), cost);
+        output.write(i, estimate, cost, clipped->local.tEnd, query.samples);
+    } else {
+        output.writeMiss(i);
     }
 }
+
+/// By ratio tracking (residual or not): several rays in flight, so that one's look-ups come from
+/// memory while others walk.
+template <class V, class Method>
+class Flight {
+  public:
+    static constexpr size_t kRays = 8;
+
+    Flight(const Volume& volume, const TrkQuery& query)
+        : volume_(volume), query_(query), extinction_(volume), superVoxels_{volume.tracked()} {}
+
+    /// Of `count` rays, kRays at most.
+    void estimate(const TrkRay* rays, size_t first, size_t count, const RayOutput<V>& output) {
+        size_t hits = 0;
+        for (size_t i = first; i < first + count; ++i) {
+            const auto clipped = volume_.clip(rayAt(query_, rays, i), volume_.field->box());
+            if (!clipped) {
+                output.writeMiss(i);
+                continue;
+            }
+            Lane& lane = lanes_[hits++];
+            lane.index = i;
+            lane.clipped = *clipped;
+            lane.settings = trackingSettings(query_, clipped->lengthPerVoxel);
+            lane.cost = {};
+            lane.mean = {};
+        }
+        for (uint32_t sample = 0; sample < query_.samples; ++sample) {
+            track(hits, sample);
+        }
+        for (size_t k = 0; k < hits; ++k) {
+            const Lane& lane = lanes_[k];
+            output.write(lane.index, lane.mean.result(lane.cost.random), lane.cost,
+                         lane.clipped.local.tEnd, query_.samples);
+        }
+    }
+
+  private:
+    using Walk = RatioWalk<Method, typename V::Extinction, typename V::Walk, Rng>;
+    struct Lane {
+        size_t index;
+        ClippedRay clipped;
+        TrackingSettings settings;
+        PathCost cost;
+        SampleMean<V::kChannels> mean;
+        Rng rng{0, 0, 0, 0};
+        std::optional<Walk> walk;
+    };
+
+    void track(size_t hits, uint32_t sample) {
+        size_t flying[kRays];
+        size_t count = 0;
+        for (size_t k = 0; k < hits; ++k) {
+            Lane& lane = lanes_[k];
+            lane.rng = Rng(query_.seed, query_.stream, rayIdAt(query_, lane.index), sample);
+            lane.walk.emplace(extinction_, superVoxels_, lane.clipped.local, lane.settings,
+                              lane.rng, lane.cost);
+            flying[count++] = k;
+        }
+        while (count > 0) {
+            count = keep(flying, count, [](Walk& walk) { return walk.advance(); });
+            for (size_t k = 0; k < count; ++k) {
+                lanes_[flying[k]].walk->prefetch();
+            }
+            count = keep(flying, count, [](Walk& walk) { return walk.weigh(); });
+        }
+        for (size_t k = 0; k < hits; ++k) {
+            lanes_[k].mean.add(lanes_[k].walk->result());
+        }
+    }
+    template <class GoesOn>
+    size_t keep(size_t (&flying)[kRays], size_t count, const GoesOn& goesOn) {
+        size_t kept = 0;
+        for (size_t k = 0; k < count; ++k) {
+            if (goesOn(*lanes_[flying[k]].walk)) {
+                flying[kept++] = flying[k];
+            }
+        }
+        return kept;
+    }
+
+    const Volume& volume_;
+    const TrkQuery& query_;
+    typename V::Extinction extinction_;
+    typename V::Walk superVoxels_;
+    Lane lanes_[kRays];
+};
+
+template <class V>
+void estimateRange(const Volume& volume, const TrkQuery& query, const TrkRay* rays, size_t begin,
+                   size_t end, const RayOutput<V>& output) {
+    const auto fly = [&](auto flight) {
+        for (size_t i = begin; i < end; i += flight.kRays) {
+            flight.estimate(rays, i, std::min(flight.kRays, end - i), output);
+        }
+    };
+    if (query.method == TRK_METHOD_RESIDUAL) {
+        fly(Flight<V, ResidualControl>(volume, query));
+    } else if (query.method == TRK_METHOD_RATIO) {
+        fly(Flight<V, NoControl>(volume, query));
+    } else {
+        for (size_t i = begin; i < end; ++i) {
+            estimateRay(volume, query, rayAt(query, rays, i), i, output);
+        }
+    }
+}
+#ifdef TRACK_AVX2
+template <class V>
+TRACK_AVX2 void estimateRangeAvx2(const Volume& volume, const TrkQuery& query, const TrkRay* rays,
+                                  size_t begin, size_t end, const RayOutput<V>& output) {
+    estimateRange(volume, query, rays, begin, end, output);
+}
+#endif
 
 }  // namespace
 
@@ -203,8 +337,15 @@ void estimateTransmittance(const Volume& volume, const TrkQuery& query, const Tr
                                                                   : ControlKind::kConstant;
     withVariant(volume, kind, [&](auto variant) {
         using V = decltype(variant);
-        forEachRay(query, rayCount, [&](size_t i) {
-            estimateRay<V>(volume, query, rayAt(query, rays, i), i, transmittance, statistics);
+        const RayOutput<V> output(volume, query, transmittance, statistics);
+        forEachRange(query, rayCount, [&](size_t begin, size_t end) {
+#ifdef TRACK_AVX2
+            if (usesAvx2()) {
+                estimateRangeAvx2(volume, query, rays, begin, end, output);
+                return;
+            }
+#endif
+            estimateRange(volume, query, rays, begin, end, output);
         });
     });
 }

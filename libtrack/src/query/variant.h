@@ -29,6 +29,9 @@ struct Variant {
         void walk(const LocalRay& ray, double t0, double t1, Visit&& visit) const {
             superVoxels.walk<C, K>(ray, t0, t1, visit);
         }
+        SuperVoxelCursor<C, K> cursor(const LocalRay& ray, double t0, double t1) const {
+            return {superVoxels, ray, t0, t1};
+        }
     };
     static std::array<double, C> integrateControl(const SuperVoxels& superVoxels,
                                                   const LocalRay& ray, size_t level,

@@ -1,0 +1,33 @@
+// SPDX-License-Identifier: Apache-2.0
+// Code for more than the least processor: what queries spend their time in is compiled once more
+// for AVX2, and chosen at run time. Results have the same bits on one kernel; kernels differ in the
+// last ones. What a bake computes has one kernel, and the same bits everywhere.
+#pragma once
+
+#include <cstdlib>
+#include <cstring>
+
+// A function with it takes in all it calls, and is compiled for AVX2 with them; nothing outside of
+// it is. Clang has no flatten that goes all the way down, and Clang builds are for finding faults.
+#if defined(__x86_64__) && defined(__GNUC__) && !defined(__clang__)
+#define TRACK_AVX2 __attribute__((target("avx2,fma"), flatten))
+#endif
+
+namespace trk {
+
+/// Whether AVX2 kernels run: where they were compiled and the processor has it, unless the
+/// environment variable TRACK_KERNEL says "baseline". Decided once a process.
+inline bool usesAvx2() {
+#ifdef TRACK_AVX2
+    static const bool chosen = [] {
+        const char* wanted = std::getenv("TRACK_KERNEL");
+        return __builtin_cpu_supports("avx2") && __builtin_cpu_supports("fma") &&
+               !(wanted && std::strcmp(wanted, "baseline") == 0);
+    }();
+    return chosen;
+#else
+    return false;
+#endif
+}
+
+}  // namespace trk

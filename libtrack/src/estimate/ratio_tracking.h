@@ -205,7 +205,7 @@ class RatioWalk {
     }
 
   private:
-    static constexpr size_t kChunk = 4;
+    static constexpr size_t kChunk = 2;
 
     struct Collision {
         Vec3d point;

@@ -226,18 +226,16 @@ class Flight {
                 output.writeMiss(i);
                 continue;
             }
-            Lane& lane = lanes_[hits++];
+            Lane& lane = lanes_[hits++].emplace();
             lane.index = i;
             lane.clipped = *clipped;
             lane.settings = trackingSettings(query_, clipped->lengthPerVoxel);
-            lane.cost = {};
-            lane.mean = {};
         }
         for (uint32_t sample = 0; sample < query_.samples; ++sample) {
             track(hits, sample);
         }
         for (size_t k = 0; k < hits; ++k) {
-            const Lane& lane = lanes_[k];
+            const Lane& lane = *lanes_[k];
             output.write(lane.index, lane.mean.result(lane.cost.random), lane.cost,
                          lane.clipped.local.tEnd, query_.samples);
         }
@@ -246,7 +244,7 @@ class Flight {
   private:
     using Walk = RatioWalk<Method, typename V::Extinction, typename V::Walk, Rng>;
     struct Lane {
-        size_t index;
+        size_t index = 0;
         ClippedRay clipped;
         TrackingSettings settings;
         PathCost cost;
@@ -259,7 +257,7 @@ class Flight {
         size_t flying[kRays];
         size_t count = 0;
         for (size_t k = 0; k < hits; ++k) {
-            Lane& lane = lanes_[k];
+            Lane& lane = *lanes_[k];
             lane.rng = Rng(query_.seed, query_.stream, rayIdAt(query_, lane.index), sample);
             lane.walk.emplace(extinction_, superVoxels_, lane.clipped.local, lane.settings,
                               lane.rng, lane.cost);
@@ -268,19 +266,19 @@ class Flight {
         while (count > 0) {
             count = keep(flying, count, [](Walk& walk) { return walk.advance(); });
             for (size_t k = 0; k < count; ++k) {
-                lanes_[flying[k]].walk->prefetch();
+                lanes_[flying[k]]->walk->prefetch();
             }
             count = keep(flying, count, [](Walk& walk) { return walk.weigh(); });
         }
         for (size_t k = 0; k < hits; ++k) {
-            lanes_[k].mean.add(lanes_[k].walk->result());
+            lanes_[k]->mean.add(lanes_[k]->walk->result());
         }
     }
     template <class GoesOn>
     size_t keep(size_t (&flying)[kRays], size_t count, const GoesOn& goesOn) {
         size_t kept = 0;
         for (size_t k = 0; k < count; ++k) {
-            if (goesOn(*lanes_[flying[k]].walk)) {
+            if (goesOn(*lanes_[flying[k]]->walk)) {
                 flying[kept++] = flying[k];
             }
         }
@@ -291,7 +289,7 @@ class Flight {
     const TrkQuery& query_;
     typename V::Extinction extinction_;
     typename V::Walk superVoxels_;
-    Lane lanes_[kRays];
+    std::optional<Lane> lanes_[kRays];  // nothing is done for those that miss
 };
 
 template <class V>

@@ -15,8 +15,10 @@
 #include <array>
 #include <cmath>
 #include <limits>
-#include <optional>
+#include <new>
 #include <string>
+#include <type_traits>
+#include <utility>
 
 namespace trk {
 namespace {
@@ -207,6 +209,20 @@ void estimateRay(const Volume& volume, const TrkQuery& query, const TrkRay& ray,
     }
 }
 
+/// Room for an object that is made when it is needed: most queries of one ray need none.
+template <class T>
+union Room {
+    static_assert(std::is_trivially_destructible_v<T>);
+
+    Room() {}
+    template <class... Arguments>
+    void emplace(Arguments&&... arguments) {
+        new (static_cast<void*>(&object)) T(std::forward<Arguments>(arguments)...);
+    }
+
+    T object;
+};
+
 /// By ratio tracking (residual or not): several rays in flight, so that one's look-ups come from
 /// memory while others walk.
 template <class V, class Method>
@@ -226,16 +242,13 @@ class Flight {
                 output.writeMiss(i);
                 continue;
             }
-            Lane& lane = lanes_[hits++].emplace();
-            lane.index = i;
-            lane.clipped = *clipped;
-            lane.settings = trackingSettings(query_, clipped->lengthPerVoxel);
+            lanes_[hits++].emplace(i, *clipped, trackingSettings(query_, clipped->lengthPerVoxel));
         }
         for (uint32_t sample = 0; sample < query_.samples; ++sample) {
             track(hits, sample);
         }
         for (size_t k = 0; k < hits; ++k) {
-            const Lane& lane = *lanes_[k];
+            const Lane& lane = lanes_[k].object;
             output.write(lane.index, lane.mean.result(lane.cost.random), lane.cost,
                          lane.clipped.local.tEnd, query_.samples);
         }
@@ -244,20 +257,23 @@ class Flight {
   private:
     using Walk = RatioWalk<Method, typename V::Extinction, typename V::Walk, Rng>;
     struct Lane {
-        size_t index = 0;
+        Lane(size_t ray, const ClippedRay& part, const TrackingSettings& how)
+            : index(ray), clipped(part), settings(how) {}
+
+        size_t index;
         ClippedRay clipped;
         TrackingSettings settings;
         PathCost cost;
         SampleMean<V::kChannels> mean;
         Rng rng{0, 0, 0, 0};
-        std::optional<Walk> walk;
+        Room<Walk> walk;
     };
 
     void track(size_t hits, uint32_t sample) {
         size_t flying[kRays];
         size_t count = 0;
         for (size_t k = 0; k < hits; ++k) {
-            Lane& lane = *lanes_[k];
+            Lane& lane = lanes_[k].object;
             lane.rng = Rng(query_.seed, query_.stream, rayIdAt(query_, lane.index), sample);
             lane.walk.emplace(extinction_, superVoxels_, lane.clipped.local, lane.settings,
                               lane.rng, lane.cost);
@@ -266,19 +282,19 @@ class Flight {
         while (count > 0) {
             count = keep(flying, count, [](Walk& walk) { return walk.advance(); });
             for (size_t k = 0; k < count; ++k) {
-                lanes_[flying[k]]->walk->prefetch();
+                lanes_[flying[k]].object.walk.object.prefetch();
             }
             count = keep(flying, count, [](Walk& walk) { return walk.weigh(); });
         }
         for (size_t k = 0; k < hits; ++k) {
-            lanes_[k]->mean.add(lanes_[k]->walk->result());
+            lanes_[k].object.mean.add(lanes_[k].object.walk.object.result());
         }
     }
     template <class GoesOn>
     size_t keep(size_t (&flying)[kRays], size_t count, const GoesOn& goesOn) {
         size_t kept = 0;
         for (size_t k = 0; k < count; ++k) {
-            if (goesOn(*lanes_[flying[k]]->walk)) {
+            if (goesOn(lanes_[flying[k]].object.walk.object)) {
                 flying[kept++] = flying[k];
             }
         }
@@ -289,21 +305,25 @@ class Flight {
     const TrkQuery& query_;
     typename V::Extinction extinction_;
     typename V::Walk superVoxels_;
-    std::optional<Lane> lanes_[kRays];  // nothing is done for those that miss
+    Room<Lane> lanes_[kRays];
 };
+
+template <class V, class Method>
+void estimateByFlights(const Volume& volume, const TrkQuery& query, const TrkRay* rays,
+                       size_t begin, size_t end, const RayOutput<V>& output) {
+    Flight<V, Method> flight(volume, query);
+    for (size_t i = begin; i < end; i += flight.kRays) {
+        flight.estimate(rays, i, std::min(flight.kRays, end - i), output);
+    }
+}
 
 template <class V>
 void estimateRange(const Volume& volume, const TrkQuery& query, const TrkRay* rays, size_t begin,
                    size_t end, const RayOutput<V>& output) {
-    const auto fly = [&](auto flight) {
-        for (size_t i = begin; i < end; i += flight.kRays) {
-            flight.estimate(rays, i, std::min(flight.kRays, end - i), output);
-        }
-    };
     if (query.method == TRK_METHOD_RESIDUAL) {
-        fly(Flight<V, ResidualControl>(volume, query));
+        estimateByFlights<V, ResidualControl>(volume, query, rays, begin, end, output);
     } else if (query.method == TRK_METHOD_RATIO) {
-        fly(Flight<V, NoControl>(volume, query));
+        estimateByFlights<V, NoControl>(volume, query, rays, begin, end, output);
     } else {
         for (size_t i = begin; i < end; ++i) {
             estimateRay(volume, query, rayAt(query, rays, i), i, output);

@@ -15,19 +15,19 @@
 
 namespace trk {
 
-/// Whether AVX2 kernels run: where they were compiled and the processor has it, unless the
-/// environment variable TRACK_KERNEL says "baseline". Decided once a process.
-inline bool usesAvx2() {
+inline bool chooseAvx2() {
 #ifdef TRACK_AVX2
-    static const bool chosen = [] {
-        const char* wanted = std::getenv("TRACK_KERNEL");
-        return __builtin_cpu_supports("avx2") && __builtin_cpu_supports("fma") &&
-               !(wanted && std::strcmp(wanted, "baseline") == 0);
-    }();
-    return chosen;
+    __builtin_cpu_init();
+    const char* wanted = std::getenv("TRACK_KERNEL");
+    return __builtin_cpu_supports("avx2") && __builtin_cpu_supports("fma") &&
+           !(wanted && std::strcmp(wanted, "baseline") == 0);
 #else
     return false;
 #endif
 }
+
+/// Whether AVX2 kernels run: where they were compiled and the processor has it, unless the
+/// environment variable TRACK_KERNEL says "baseline". Decided when the library is loaded.
+inline const bool kUsesAvx2 = chooseAvx2();
 
 }  // namespace trk

@@ -111,8 +111,14 @@ void sampleExactly(const Field& field, const LocalRay& ray, double t0, double t1
         double t = tEnter + (tExit - tEnter) * (target - depth[chosen]) / cell[chosen];
         std::array<double, C> part{};
         for (int i = 0; i < 60 && hi - lo > 1e-15 * tExit; ++i) {
-            uint64_t regions = 0;
-            part = field.integrate(ray, tEnter, t, cost.lookups, regions);
+            part = {};
+            field.forEachCell(ray, tEnter, t, [&](double, double, const auto& piece) {
+                cost.lookups += 2;
+                for (size_t c = 0; c < C; ++c) {
+                    part[c] += piece[c];
+                }
+                return true;
+            });
             const double missing = target - depth[chosen] - part[chosen];
             (missing > 0 ? lo : hi) = t;
             const double slope = field.extinction(ray.at(t))[chosen];

@@ -157,6 +157,7 @@ class RatioWalk {
         while (count_ < kChunk) {
             if (!isInside_) {
                 if (!hasNext_ && !cursor_.next(superVoxel_, tEnter_, tExit_)) {
+                    isDone_ = true;
                     break;
                 }
                 hasNext_ = true;
@@ -191,6 +192,9 @@ class RatioWalk {
             }
         }
         cost_.lookups += count_;
+        if (isDone_) {  // nothing is left for roulette to spare
+            return false;
+        }
         // The control of the super-voxel that the walk is in is not in the throughput yet: it may
         // still be needed to outweigh collisions that amplify.
         return settings_.roulette ? sofar_.survives(random_, cost_.random) : !sofar_.isZero();
@@ -290,6 +294,7 @@ class RatioWalk {
     double tExit_ = 0;
     bool hasNext_ = false;   // it is not begun
     bool isInside_ = false;  // it is not done
+    bool isDone_ = false;    // nor is there another one
     double rate_ = 0;        // a world length
     double ratePerVoxel_ = 0;
     double remaining_ = 0;  // optical distances: to its end

@@ -71,7 +71,7 @@ std::array<double, C> DensityField::integrate(const LocalRay& ray, double t0, do
                                               uint64_t& lookups, uint64_t& regions) const {
     const auto run = [&](const auto* bricks) {
 #ifdef TRACK_AVX2
-        if (usesAvx2()) {
+        if (kUsesAvx2) {
             return integrateLineAvx2<C>(*this, bricks, ray, t0, t1, lookups, regions);
         }
 #endif

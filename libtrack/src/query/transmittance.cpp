@@ -244,7 +244,7 @@ class Flight {
             }
             lanes_[hits++].emplace(i, *clipped, trackingSettings(query_, clipped->lengthPerVoxel));
         }
-        for (uint32_t sample = 0; sample < query_.samples; ++sample) {
+        for (uint32_t sample = 0; hits > 0 && sample < query_.samples; ++sample) {
             track(hits, sample);
         }
         for (size_t k = 0; k < hits; ++k) {
@@ -358,7 +358,7 @@ void estimateTransmittance(const Volume& volume, const TrkQuery& query, const Tr
         const RayOutput<V> output(volume, query, transmittance, statistics);
         forEachRange(query, rayCount, [&](size_t begin, size_t end) {
 #ifdef TRACK_AVX2
-            if (usesAvx2()) {
+            if (kUsesAvx2) {
                 estimateRangeAvx2(volume, query, rays, begin, end, output);
                 return;
             }

@@ -104,6 +104,28 @@ TEST(Preview, ComesNearerToExactAsSuperVoxelsShrink) {
     }
 }
 
+TEST(Preview, LightIsNoFinerThanPicturesShow) {
+    // Two solid bars of 64 and 160 super-voxels: places of light grow with a picture's pixels.
+    size_t bytes[2] = {};
+    float middle[2] = {};
+    for (const int i : {0, 1}) {
+        const int length = i == 0 ? 1024 : 2560;
+        const auto grid = openvdb::FloatGrid::create();
+        grid->fill(openvdb::CoordBBox(openvdb::Coord(0), openvdb::Coord(length - 1, 127, 127)), 1);
+        grid->setName("density");
+        const std::string vdb = fixtures::write("bar.vdb", {grid});
+        const std::string sidecar = fixtures::path("bar.track.vdb");
+        fixtures::bake(vdb, sidecar, 16, 0);
+        const LitPreview lit(sidecar, litOptions(0, 0.02f));
+        bytes[i] = lit.bytes();
+        const vdbtools::Camera camera =
+            vdbtools::cameraAt({{length / 2.0, 500, 500}}, {{length / 2.0, 64, 64}}, 1);
+        middle[i] = lit.draw(camera, 5, 5, [](double) {}).light[0][12];
+    }
+    EXPECT_LT(static_cast<double>(bytes[1]), 1.3 * static_cast<double>(bytes[0]));
+    EXPECT_NEAR(middle[1] / middle[0], 1, 0.02);
+}
+
 TEST(Preview, LayersMeanWhatTheirNamesSay) {
     // A box of density 1 from 0 to 64 along each axis; at scale 0.1 half the light is left after
     // ln 2 / 0.1 = 6.9 units.

@@ -38,6 +38,9 @@ constexpr double kSunRadius = 5;  // degrees
 constexpr double kShadowStart = 1;
 constexpr int kShadowSteps = 1;
 constexpr double kShadowSpread = 1.5;
+// Along the longest side of what is drawn, places of which the light is computed: light varies less
+// than density, and a volume of more cells has cells the size of a pixel.
+constexpr int64_t kMostPlaces = 128;
 
 /// `height`: of a direction of unit length.
 Color skyRadiance(double height) {
@@ -110,15 +113,29 @@ class DepthInCell {
     double whole_;
 };
 
-/// Whether the light at a vertex of a brick is ever looked up: a cell beside it holds something. In
-/// constant regions it always is.
-bool isNeeded(const DensityField& field, SparseTable::Entry entry, const Int3& at) {
+/// Cells of a brick's edge between whose corners light is interpolated: all of them, unless there
+/// would be too many.
+int64_t lightCells(const trk::IntBox& box) {
+    int64_t longest = 0;
+    for (size_t a = 0; a < 3; ++a) {
+        longest = std::max(longest, box.hi[a] - box.lo[a]);
+    }
+    int64_t cells = DensityField::kBrickSize;
+    while (cells > 1 && longest * cells / DensityField::kBrickSize > kMostPlaces) {
+        cells /= 2;
+    }
+    return cells;
+}
+
+/// Whether the light at a vertex of a brick is ever looked up: a cell beside it, `step` voxels
+/// wide, holds something. In constant regions it always is.
+bool isNeeded(const DensityField& field, SparseTable::Entry entry, const Int3& at, int64_t step) {
     if (DensityField::isConstant(entry)) {
         return true;
     }
     constexpr int64_t kEdge = DensityField::kBrickEdge;
-    const auto lo = [&](size_t a) { return std::max<int64_t>(at[a] - 1, 0); };
-    const auto hi = [&](size_t a) { return std::min<int64_t>(at[a] + 1, kEdge - 1); };
+    const auto lo = [&](size_t a) { return std::max<int64_t>(at[a] - step, 0); };
+    const auto hi = [&](size_t a) { return std::min<int64_t>(at[a] + step, kEdge - 1); };
     for (int64_t x = lo(0); x <= hi(0); ++x) {
         for (int64_t y = lo(1); y <= hi(1); ++y) {
             for (int64_t z = lo(2); z <= hi(2); ++z) {
@@ -230,10 +247,11 @@ LitPreview::Light LitPreview::computeLight(const Vec3d& local) const {
 /// coarsely in constant regions.
 void LitPreview::tabulateLight() {
     const DensityField& field = *volume_.field;
+    const int64_t brickCells = lightCells(field.box());
     size_t places = 0;
     const auto add = [&](const Int3& origin, int shift, SparseTable::Entry entry) {
         const bool coarse = DensityField::isConstant(entry) && shift == DensityField::kBrickShift;
-        const int64_t cells = coarse ? 1 : DensityField::kBrickSize;
+        const int64_t cells = coarse ? 1 : brickCells;
         regions_.push_back({origin, shift, entry, cells, places});
         places += static_cast<size_t>((cells + 1) * (cells + 1) * (cells + 1));
         return static_cast<SparseTable::Entry>(regions_.size());
@@ -260,11 +278,13 @@ void LitPreview::tabulateLight() {
         trk::parallelFor(static_cast<size_t>(edge * edge * edge), 1, [&](size_t k) {
             const auto i = static_cast<int64_t>(k);
             const Int3 at{{i / (edge * edge), i / edge % edge, i % edge}};
-            if (!isNeeded(field, region.entry, at)) {
-                return;
-            }
             const double spacing =
                 std::ldexp(1.0, region.shift) / static_cast<double>(region.cells);
+            const auto step = static_cast<int64_t>(spacing);  // of a brick
+            if (!isNeeded(field, region.entry, {{step * at[0], step * at[1], step * at[2]}},
+                          step)) {
+                return;
+            }
             Vec3d place;
             for (size_t a = 0; a < 3; ++a) {
                 place[static_cast<int>(a)] =

@@ -13,6 +13,9 @@
 #define TRACK_AVX2 __attribute__((target("avx2,fma"), flatten))
 #endif
 
+// Of a function that is rare: it stays one of its own, which spares copies in all that call it.
+#define TRACK_APART __attribute__((noinline))
+
 namespace trk {
 
 inline bool chooseAvx2() {
@@ -29,5 +32,9 @@ inline bool chooseAvx2() {
 /// Whether AVX2 kernels run: where they were compiled and the processor has it, unless the
 /// environment variable TRACK_KERNEL says "baseline". Decided when the library is loaded.
 inline const bool kUsesAvx2 = chooseAvx2();
+
+inline const char* kernelName() {
+    return kUsesAvx2 ? "avx2" : "baseline";
+}
 
 }  // namespace trk

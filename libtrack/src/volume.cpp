@@ -67,13 +67,14 @@ std::optional<ClippedRay> Volume::clip(const TrkRay& ray, const IntBox& box) con
                                 static_cast<double>(ray.direction[2])}};
     const Vec3d indexDirection = worldToIndex.vector(worldDirection);
     const double voxelsPerT = length(indexDirection);
+    const double tPerVoxel = 1 / voxelsPerT;
     Vec3d origin = worldToIndex.point(worldOrigin);
     double t0 = static_cast<double>(ray.tMin) * voxelsPerT;
     double t1 = static_cast<double>(ray.tMax) * voxelsPerT;
     for (int a = 0; a < 3; ++a) {
         const auto axis = static_cast<size_t>(a);
         origin[a] -= static_cast<double>(anchor[axis]);
-        const double d = indexDirection[a] / voxelsPerT;
+        const double d = indexDirection[a] * tPerVoxel;
         local.direction[a] = d;
         const auto lo = static_cast<double>(box.lo[axis]);
         const auto hi = static_cast<double>(box.hi[axis]);
@@ -87,8 +88,8 @@ std::optional<ClippedRay> Volume::clip(const TrkRay& ray, const IntBox& box) con
             continue;
         }
         local.inverse[a] = 1 / d;
-        const double ta = (lo - origin[a]) / d;
-        const double tb = (hi - origin[a]) / d;
+        const double ta = (lo - origin[a]) * local.inverse[a];
+        const double tb = (hi - origin[a]) * local.inverse[a];
         t0 = std::max(t0, std::min(ta, tb));
         t1 = std::min(t1, std::max(ta, tb));
     }
@@ -102,9 +103,9 @@ std::optional<ClippedRay> Volume::clip(const TrkRay& ray, const IntBox& box) con
             static_cast<double>(box.hi[axis]));
     }
     local.tEnd = t1 - t0;
-    clipped.lengthPerVoxel = length(worldDirection) / voxelsPerT;
-    clipped.tStart = t0 / voxelsPerT;
-    clipped.tPerVoxel = 1 / voxelsPerT;
+    clipped.lengthPerVoxel = length(worldDirection) * tPerVoxel;
+    clipped.tStart = t0 * tPerVoxel;
+    clipped.tPerVoxel = tPerVoxel;
     return clipped;
 }
 

@@ -106,7 +106,9 @@ double SuperVoxels::chooseShare(TrkChoice choice, double min, double max, double
 
 SuperVoxels::SuperVoxels(BakedVolume baked, const std::vector<double>& scales, TrkChoice choice,
                          double diagonal)
-    : table_(std::move(baked.table)), kind_(baked.kind), levels_(std::move(baked.levels)) {
+    : table_(std::move(baked.table).flattened()),
+      kind_(baked.kind),
+      levels_(std::move(baked.levels)) {
     const size_t channels = scales.size();
     // A tinted volume has three channels of one item.
     const auto itemOf = [&](size_t i) { return baked.channels == channels ? i : i / channels; };

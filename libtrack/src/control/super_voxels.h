@@ -278,13 +278,22 @@ class SuperVoxelCursor {
           inverseSize_(std::ldexp(1.0, -superVoxels.table_.itemShift())) {}
 
     bool next(View& view, double& tEnter, double& tExit) {
-        if (taken_ == found_) {
-            find();
-            if (found_ == 0) {
+        if (at_ == count_) {
+            at_ = 0;
+            count_ = table_.refill();
+            if (count_ == 0) {
                 return false;
             }
+            for (size_t i = 0; i < count_; ++i) {
+                const size_t item = SparseTable::index(table_.entry(i)) * C;
+                __builtin_prefetch(&superVoxels_.items_[item]);
+                if constexpr (K != ControlKind::kConstant) {
+                    __builtin_prefetch(superVoxels_.shapes_.data() + item * View::kStride);
+                }
+            }
         }
-        const Crossing& crossing = crossings_[taken_++];
+        Crossing crossing;
+        table_.template take<K != ControlKind::kConstant>(at_++, crossing);
         const size_t item = SparseTable::index(crossing.entry) * C;
         view = View(&superVoxels_.items_[item], &superVoxels_.ranges_[item],
                     superVoxels_.shapes_.data() + item * View::kStride, crossing.lo, inverseSize_);
@@ -294,28 +303,11 @@ class SuperVoxelCursor {
     }
 
   private:
-    static constexpr size_t kAhead = 8;
-
-    void find() {
-        taken_ = found_ = 0;
-        constexpr bool kIsPlaced = K != ControlKind::kConstant;
-        while (found_ < kAhead && table_.template next<kIsPlaced>(crossings_[found_])) {
-            const size_t item = SparseTable::index(crossings_[found_++].entry) * C;
-            __builtin_prefetch(&superVoxels_.items_[item]);
-            if constexpr (K == ControlKind::kConstant) {
-                __builtin_prefetch(&superVoxels_.ranges_[item]);
-            } else {
-                __builtin_prefetch(superVoxels_.shapes_.data() + item * View::kStride);
-            }
-        }
-    }
-
     const SuperVoxels& superVoxels_;
     TableCursor table_;
     double inverseSize_;
-    size_t taken_ = 0;
-    size_t found_ = 0;
-    Crossing crossings_[kAhead];
+    size_t at_ = 0;
+    size_t count_ = 0;
 };
 
 template <size_t C, ControlKind K, class Visit>

@@ -83,12 +83,16 @@ class Throughput {
         return std::all_of(products_.begin(), products_.end(),
                            [](const ScaledProduct& p) { return p.isZero(); });
     }
+    const std::array<double, C>& opticalDepth() const { return opticalDepth_; }
+    void setOpticalDepth(const std::array<double, C>& depth) { opticalDepth_ = depth; }
     /// Whether any product is large enough for roulette to leave it alone, by what is known without
     /// an exponential.
-    bool matters() const {
+    bool matters() const { return matters(opticalDepth_); }
+    /// The same, were this the optical depth.
+    bool matters(const std::array<double, C>& depth) const {
         bool any = false;
         for (size_t c = 0; c < C; ++c) {
-            any = any || opticalDepth_[c] < limits_[c];
+            any = any || depth[c] < limits_[c];
         }
         return any;
     }
@@ -156,11 +160,10 @@ class RatioWalk {
         count_ = 0;
         while (count_ < kChunk) {
             if (!isInside_) {
-                if (!hasNext_ && !cursor_.next(superVoxel_, tEnter_, tExit_)) {
+                if (!hasNext_ && !findNext()) {
                     isDone_ = true;
                     break;
                 }
-                hasNext_ = true;
                 if (!enter()) {
                     break;
                 }
@@ -220,12 +223,57 @@ class RatioWalk {
     using Cursor = decltype(std::declval<const SuperVoxels&>().cursor(
         std::declval<const LocalRay&>(), 0.0, 0.0));
 
+    template <class View>
+    double rateOf(const View& superVoxel) const {
+        double rate = Method::rate(superVoxel, 0, settings_.rateBase);
+        for (size_t c = 1; c < C; ++c) {
+            rate = std::max(rate, Method::rate(superVoxel, c, settings_.rateBase));
+        }
+        return rate;
+    }
+    double mostLookups(double length) const {
+        return settings_.exactFallback ? exactCost_(length) : kMostLookups;
+    }
+
+    /// Passes super-voxels as long as nothing happens in them but what is integrated; false where
+    /// there are no more. What is true of most of them is worth a loop of its own, in registers.
+    bool findNext() {
+        const double perVoxel = settings_.rate * settings_.lengthPerVoxel;
+        double distance = distance_;
+        std::array<double, C> depth = sofar_.opticalDepth();
+        uint64_t passed = 0;
+        bool isRandom = false;
+        typename Cursor::View view;
+        double tEnter = 0;
+        double tExit = 0;
+        while ((hasNext_ = cursor_.next(view, tEnter, tExit))) {
+            const double length = tExit - tEnter;
+            const double optical = rateOf(view) * perVoxel * length;
+            if (distance < optical || optical > mostLookups(length) ||
+                (settings_.roulette && !sofar_.matters(depth))) {
+                break;
+            }
+            distance -= optical;
+            for (size_t c = 0; c < C; ++c) {
+                depth[c] +=
+                    settings_.lengthPerVoxel * Method::integrate(view, c, ray_, tEnter, tExit);
+            }
+            isRandom = isRandom || optical > 0;
+            ++passed;
+        }
+        superVoxel_ = view;
+        tEnter_ = tEnter;
+        tExit_ = tExit;
+        distance_ = distance;
+        sofar_.setOpticalDepth(depth);
+        cost_.superVoxels += passed;
+        cost_.random = cost_.random || isRandom;
+        return hasNext_;
+    }
+
     /// Begins with the super-voxel at hand, unless what is left is to be weighed first, or to end.
     bool enter() {
-        double base = Method::rate(superVoxel_, 0, settings_.rateBase);
-        for (size_t c = 1; c < C; ++c) {
-            base = std::max(base, Method::rate(superVoxel_, c, settings_.rateBase));
-        }
+        const double base = rateOf(superVoxel_);
         // Where the super-voxel is homogeneous, walks do not end.
         if (settings_.roulette && base > 0 && !sofar_.matters()) {
             if (count_ > 0) {
@@ -241,7 +289,7 @@ class RatioWalk {
         rate_ = base * settings_.rate;
         ratePerVoxel_ = rate_ * settings_.lengthPerVoxel;
         remaining_ = ratePerVoxel_ * length;
-        if (remaining_ > (settings_.exactFallback ? exactCost_(length) : kMostLookups)) {
+        if (remaining_ > mostLookups(length)) {
             uint64_t bricks = 0;
             const auto exact = field_.integrate(ray_, tEnter_, tExit_, cost_.lookups, bricks);
             for (size_t c = 0; c < C; ++c) {

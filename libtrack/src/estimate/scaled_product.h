@@ -2,6 +2,7 @@
 // A product of many weights that neither overflows nor underflows.
 #pragma once
 
+#include <algorithm>
 #include <cmath>
 #include <cstdint>
 #include <cstring>
@@ -45,9 +46,9 @@ class ScaledProduct {
         constexpr double kLimit = static_cast<double>(std::numeric_limits<float>::max());
         const double logScale = static_cast<double>(exponent_) * kLn2;
         // Beyond +-1400 the exponential decides alone: |value_| lies within 2^+-500.
-        const double power = std::fmin(std::fmax(logScale - opticalDepth, -1400.0), 1400.0);
-        const double result = value_ * std::exp(0.5 * power) * std::exp(0.5 * power);
-        return std::fmin(std::fmax(result, -kLimit), kLimit);
+        const double power = std::min(std::max(logScale - opticalDepth, -1400.0), 1400.0);
+        const double root = std::exp(0.5 * power);
+        return std::min(std::max(value_ * root * root, -kLimit), kLimit);
     }
 
   private:

@@ -12,7 +12,7 @@ namespace trk {
 DensityField::DensityField(size_t channels, SparseTable table, std::vector<float> constants,
                            RawArray<float> floats, RawArray<uint16_t> halfs)
     : channels_(channels),
-      table_(std::move(table)),
+      table_(std::move(table).flattened()),
       constants_(std::move(constants)),
       floats_(std::move(floats)),
       halfs_(std::move(halfs)),
@@ -29,21 +29,34 @@ template <size_t C, class Stored>
 std::array<double, C> integrateLine(const DensityField& field, const Stored* bricks,
                                     const LocalRay& ray, double t0, double t1, uint64_t& lookups,
                                     uint64_t& regions) {
-    LineIntegral<C, Stored> line(ray);
+    LineIntegral<C, Stored> line(field.table(), bricks, ray);
     std::array<double, C> sum{};
     TableCursor cursor(field.table(), ray, t0, t1);
     Crossing crossing{};
     uint64_t met = 0;
-    while (cursor.next(crossing)) {
-        ++met;
-        if (DensityField::isConstant(crossing.entry)) {
-            const float* constant = field.constant(crossing.entry);
-            for (size_t c = 0; c < C; ++c) {
-                sum[c] += static_cast<double>(constant[c]) * (crossing.tExit - crossing.tEnter);
+    while (const size_t count = cursor.refill()) {
+        met += count;
+        for (size_t i = 0; i < count;) {
+            cursor.take<true>(i, crossing);
+            if (DensityField::isConstant(crossing.entry)) {
+                const float* constant = field.constant(crossing.entry);
+                for (size_t c = 0; c < C; ++c) {
+                    sum[c] += static_cast<double>(constant[c]) * (crossing.tExit - crossing.tEnter);
+                }
+                ++i;
+                continue;
             }
-        } else {
-            line.add(bricks + (crossing.entry - 1) * DensityField::kBrickVertices * C, crossing.lo,
-                     crossing.tEnter, crossing.tExit);
+            // Bricks one after another are one stretch.
+            Crossing last = crossing;
+            for (++i; i < count && !DensityField::isConstant(cursor.entry(i)); ++i) {
+                Crossing next;
+                cursor.take<false>(i, next);
+                if (next.tEnter != last.tExit) {
+                    break;
+                }
+                last = next;
+            }
+            line.add(crossing.lo, crossing.tEnter, last.tExit);
         }
     }
     const std::array<double, C> cells = line.sum();
@@ -51,7 +64,7 @@ std::array<double, C> integrateLine(const DensityField& field, const Stored* bri
         sum[c] += cells[c];
     }
     regions += met;
-    lookups += 2 * line.cells();
+    lookups += 2 * line.cellCount();
     return sum;
 }
 

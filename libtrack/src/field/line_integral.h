@@ -4,6 +4,8 @@
 #pragma once
 
 #include "density_field.h"
+#include "space/lanes.h"
+#include "space/lattice.h"
 
 #include <algorithm>
 #include <array>
@@ -13,131 +15,101 @@
 
 namespace trk {
 
-/// Four or eight numbers at once, by the compiler's vector types: what the processor has of them.
-using Float4 = float __attribute__((vector_size(16)));
-using Float8 = float __attribute__((vector_size(32)));
-using Double2 = double __attribute__((vector_size(16)));
-using Double4 = double __attribute__((vector_size(32)));
-
-/// Cells of bricks along a ray, and what the density there integrates to. C: its channels.
+/// Stretches of a ray inside bricks, and what the density there integrates to. C: its channels.
 template <size_t C, class Stored>
 class LineIntegral {
   public:
-    explicit LineIntegral(const LocalRay& ray) : ray_(ray) {
-        constexpr std::ptrdiff_t kStrides[3] = {81 * C, 9 * C, C};
+    /// `bricks`: the values of all, one after another. All arguments must live as long.
+    LineIntegral(const SparseTable& table, const Stored* bricks, const LocalRay& ray)
+        : table_(table), bricks_(bricks), ray_(ray), all_(table.lattice(table.depth())) {}
+
+    /// Adds [t0, t1], which begins in the brick at `lo`, lies in bricks alone and crosses 256 of
+    /// them at most.
+    void add(const Vec3d& lo, double t0, double t1) {
+        // The cells of the bricks around: those of all may be more than can be counted.
+        constexpr int64_t kAround = 256;
+        Lattice cells;
+        cells.size = 1;
+        int32_t cell[3];
         for (size_t a = 0; a < 3; ++a) {
-            const bool backwards = ray.direction[static_cast<int>(a)] < 0;
-            stride_[a] = backwards ? -kStrides[a] : kStrides[a];
-            step_[a][1] = backwards ? -1 : 1;
+            const auto voxel = static_cast<int64_t>(lo[static_cast<int>(a)]);
+            const int64_t brick = (voxel >> DensityField::kBrickShift) - all_.first[a];
+            const int64_t first = std::max<int64_t>(brick - kAround, 0);
+            const int64_t end = std::min<int64_t>(brick + kAround, all_.extent[a]);
+            firstBrick_[a] = static_cast<int32_t>(first);
+            cells.first[a] = (all_.first[a] + first) << DensityField::kBrickShift;
+            cells.extent[a] = static_cast<int32_t>((end - first) << DensityField::kBrickShift);
+            origin_[a] = ray_.origin[static_cast<int>(a)] - static_cast<double>(cells.first[a]);
+            const auto begin = static_cast<int32_t>(voxel - cells.first[a]);
+            cell[a] = cells.cellAt(ray_, t0, a, begin, begin + 8);
+        }
+        LatticeWalk walk;
+        walk.begin(cells, ray_, cell, t0, t1);
+        LatticeWindow<kMost> window;
+        while (!walk.isDone()) {
+            walk.cross(window);
+            find(window);
+            sumUp(window);
         }
     }
 
-    /// Adds the cells of a brick whose lower corner is at `lo`, between tEnter and tExit.
-    void add(const Stored* brick, const Vec3d& lo, double tEnter, double tExit) {
-        constexpr std::ptrdiff_t kStrides[3] = {81 * C, 9 * C, C};
-        const auto within = [&](size_t a) {
-            return static_cast<std::ptrdiff_t>(cellAt_[a] - lo[static_cast<int>(a)]);
-        };
-        // Most bricks begin where the last one ended.
-        if (t_ != tEnter || ((within(0) | within(1) | within(2)) & ~std::ptrdiff_t{7}) != 0) {
-            start(tEnter, lo);
-        }
-        const Stored* from =
-            brick + within(0) * kStrides[0] + within(1) * kStrides[1] + within(2) * kStrides[2];
-        double cell[3] = {cellAt_[0], cellAt_[1], cellAt_[2]};
-        size_t x = at_[0];
-        size_t y = at_[1];
-        size_t z = at_[2];
-        double t = tEnter;
-        size_t n = count_;
-        for (bool last = false; !last;) {
-            const double tX = planes_[0][x];
-            const double tY = planes_[1][y];
-            const double tZ = planes_[2][z];
-            const double next = std::min(std::min(tX, tY), tZ);
-            last = !(next < tExit);
-            tEnter_[n] = t;
-            t = std::max(t, std::min(next, tExit));
-            tExit_[n] = t;
-            cell_[0][n] = cell[0];
-            cell_[1][n] = cell[1];
-            cell_[2][n] = cell[2];
-            corner_[n++] = from;
-            __builtin_prefetch(from);
-            __builtin_prefetch(from + kStrides[1]);
-            __builtin_prefetch(from + kStrides[0]);
-            __builtin_prefetch(from + kStrides[0] + kStrides[1]);
-            // Not by branches: nobody could predict them.
-            const size_t isX = static_cast<size_t>(tX <= tY) & static_cast<size_t>(tX <= tZ);
-            const size_t isY = static_cast<size_t>(tY <= tZ) & (isX ^ 1);
-            const size_t isZ = (isX | isY) ^ 1;
-            x += isX;
-            y += isY;
-            z += isZ;
-            cell[0] += step_[0][isX];
-            cell[1] += step_[1][isY];
-            cell[2] += step_[2][isZ];
-            from += stride_[isY + 2 * isZ];
-            if ((x | y | z) >= kPlanes) {
-                x == kPlanes ? refill(0, x) : y == kPlanes ? refill(1, y) : refill(2, z);
-            }
-        }
-        t_ = t;
-        cellAt_[0] = cell[0];
-        cellAt_[1] = cell[1];
-        cellAt_[2] = cell[2];
-        at_[0] = x;
-        at_[1] = y;
-        at_[2] = z;
-        cells_ += n - count_;
-        count_ = n;
-        if (count_ > kCells) {
-            flush();
-        }
-    }
-
-    /// Everything added so far, in voxel lengths.
-    std::array<double, C> sum() {
-        flush();
+    /// Of everything added so far, in voxel lengths.
+    std::array<double, C> sum() const {
         std::array<double, C> result;
         for (size_t c = 0; c < C; ++c) {
             result[c] = (sum_[c][0] + sum_[c][1]) + (sum_[c][2] + sum_[c][3]);
         }
         return result;
     }
-    uint64_t cells() const { return cells_; }
+    uint64_t cellCount() const { return met_; }
 
   private:
-    static constexpr size_t kCells = 64;        // before they are looked at
-    static constexpr size_t kMostInBrick = 22;  // a line meets no more
-    static constexpr size_t kRoom = kCells + kMostInBrick + 4;
+    static constexpr size_t kMost = 64;  // cells whose values are on their way from memory at once
 
-    static constexpr size_t kPlanes = 16;
-
-    /// Where a ray that is at t is in a brick, and the times of the planes ahead.
-    void start(double t, const Vec3d& lo) {
-        t_ = t;
-        for (size_t a = 0; a < 3; ++a) {
-            const int axis = static_cast<int>(a);
-            const double x = ray_.origin[axis] - lo[axis] + t * ray_.direction[axis];
-            cellAt_[a] = lo[axis] + std::min(std::max(static_cast<int>(x), 0), 7);
-            plane_[a] = cellAt_[a] + (step_[a][1] < 0 ? 0 : 1);
-            refill(a, at_[a]);
+    /// Where the lower corners of the cells are.
+    void find(const LatticeWindow<kMost>& window) {
+        int32_t vertex[kMost];
+        int32_t brick[kMost];  // unlike that of any other brick nearby
+        for (size_t i = 0; i < window.padded(); ++i) {
+            const int32_t x = window.cell(0, i);
+            const int32_t y = window.cell(1, i);
+            const int32_t z = window.cell(2, i);
+            cell_[0][i] = x;
+            cell_[1][i] = y;
+            cell_[2][i] = z;
+            vertex[i] = ((x & 7) * 9 + (y & 7)) * 9 + (z & 7);
+            brick[i] = (x >> 3) * 4096 + (y >> 3) * 64 + (z >> 3);
         }
-    }
-    void refill(size_t axis, size_t& at) {
-        const int a = static_cast<int>(axis);
-        for (size_t k = 0; k < kPlanes; ++k) {
-            planes_[axis][k] =
-                (plane_[axis] + static_cast<double>(k) * step_[axis][1] - ray_.origin[a]) *
-                ray_.inverse[a];
+        const Stored* values = nullptr;
+        int32_t last = 0;
+        for (size_t i = 0; i < window.count; ++i) {
+            if (!values || brick[i] != last) {
+                last = brick[i];
+                const SparseTable::Entry entry = table_.entryAt(
+                    table_.depth(), firstBrick_[0] + (cell_[0][i] >> 3),
+                    firstBrick_[1] + (cell_[1][i] >> 3), firstBrick_[2] + (cell_[2][i] >> 3));
+                // By rounding, a cell of no length may lie in what is no brick.
+                values = DensityField::isConstant(entry)
+                             ? kNothing
+                             : bricks_ + (entry - 1) * DensityField::kBrickVertices * C;
+            }
+            const Stored* corner = values + static_cast<size_t>(vertex[i]) * C;
+            corner_[i] = corner;
+            __builtin_prefetch(corner);
+            __builtin_prefetch(corner + 9 * C);
+            __builtin_prefetch(corner + 81 * C);
+            __builtin_prefetch(corner + 90 * C);
         }
-        plane_[axis] += static_cast<double>(kPlanes) * step_[axis][1];
-        at = 0;
+        met_ += window.count;
     }
 
     // Vectors go by reference: how they would be returned depends on the processor.
     static void load(const double* from, Double4& to) { std::memcpy(&to, from, sizeof(to)); }
+    static void load(const int32_t* from, Double4& to) {
+        Int4 integers;
+        std::memcpy(&integers, from, sizeof(integers));
+        to = __builtin_convertvector(integers, Double4);
+    }
     static void join(const Double4& a, const Double4& b, Float8& to) {
         const Float4 x = __builtin_convertvector(a, Float4);
         const Float4 y = __builtin_convertvector(b, Float4);
@@ -180,20 +152,21 @@ class LineIntegral {
     /// Four cells at a time, each at two Gauss points: along a line the density of a cell is a
     /// cubic, for which they are exact. Each weight is rounded on its own: near the far face of a
     /// cell next to empty space the value is the small difference between 1 and the fraction.
-    void flush() {
+    void sumUp(LatticeWindow<kMost>& window) {
         constexpr double kGauss = 0.57735026918962576451;  // 1/sqrt(3)
-        for (; count_ % 4 != 0; ++count_) {                // of no length
-            tEnter_[count_] = tExit_[count_] = tExit_[count_ - 1];
+        size_t count = window.count;
+        for (; count % 4 != 0; ++count) {  // of no length
+            window.time[count + 1] = window.time[count];
             for (auto& cell : cell_) {
-                cell[count_] = cell[count_ - 1];
+                cell[count] = cell[count - 1];
             }
-            corner_[count_] = corner_[count_ - 1];
+            corner_[count] = corner_[count - 1];
         }
-        for (size_t i = 0; i < count_; i += 4) {
+        for (size_t i = 0; i < count; i += 4) {
             Double4 tEnter;
             Double4 tExit;
-            load(tEnter_ + i, tEnter);
-            load(tExit_ + i, tExit);
+            load(window.time + i, tEnter);
+            load(window.time + i + 1, tExit);
             const Double4 half = 0.5 * (tExit - tEnter);
             const Double4 middle = tEnter + half;
             const Double4 first = middle - kGauss * half;
@@ -203,7 +176,7 @@ class LineIntegral {
             for (int a = 0; a < 3; ++a) {
                 Double4 cell;
                 load(cell_[a] + i, cell);
-                const Double4 origin = ray_.origin[a] - cell;
+                const Double4 origin = origin_[a] - cell;
                 const Double4 f = origin + first * ray_.direction[a];
                 const Double4 g = origin + second * ray_.direction[a];
                 join(f, g, far[a]);
@@ -231,24 +204,20 @@ class LineIntegral {
                                    __builtin_convertvector(b, Double4));
             }
         }
-        count_ = 0;
     }
 
+    static constexpr Stored kNothing[DensityField::kBrickVertices * C] = {};
+
+    const SparseTable& table_;
+    const Stored* bricks_;
     const LocalRay& ray_;
-    std::ptrdiff_t stride_[3];   // to the next cell of an axis
-    double step_[3][2]{};        // nothing, or a step
-    double t_ = -1;              // where the cells added so far end
-    double cellAt_[3]{};         // the cell there
-    double plane_[3];            // the first one beyond planes_
-    double planes_[3][kPlanes];  // times of the planes of an axis, from at_ on ahead
-    size_t at_[3];
-    size_t count_ = 0;
-    uint64_t cells_ = 0;
+    Lattice all_;  // bricks
+    int32_t firstBrick_[3];
+    double origin_[3];  // of the ray, from the first brick on
+    uint64_t met_ = 0;
     Double4 sum_[C]{};
-    double tEnter_[kRoom];
-    double tExit_[kRoom];
-    double cell_[3][kRoom];  // lower corners, in local space
-    const Stored* corner_[kRoom];
+    int32_t cell_[3][kMost];  // from the first brick on
+    const Stored* corner_[kMost];
 };
 
 }  // namespace trk

@@ -1,10 +1,11 @@
 // SPDX-License-Identifier: Apache-2.0
-// A sparse table over integer space and the walk of a ray through it. Both the extinction field
-// (whose items are bricks of 8^3 voxels) and the super-voxels (items of N^3 voxels) live in one.
+// A sparse table over integer space. Both the density field (whose items are bricks of 8^3 voxels)
+// and the super-voxels (items of N^3 voxels) live in one.
 #pragma once
 
 #include "hash.h"
-#include "space/local_ray.h"
+#include "kernel.h"
+#include "space/lattice.h"
 
 #include <array>
 #include <bitset>
@@ -21,7 +22,7 @@ namespace trk {
 /// equal children are one node, and one whose children are all one tile or item is that entry:
 /// large tiles have large but very regular surfaces, which thus cost next to nothing. A node with
 /// one child that is not empty is a link, of 8 bytes instead of 2048. Memory goes with what is
-/// occupied; a step of the walk crosses the largest region found empty.
+/// occupied.
 class SparseTable {
   public:
     using Entry = uint32_t;
@@ -114,6 +115,30 @@ class SparseTable {
     }
 
     int itemShift() const { return itemShift_; }
+    /// Levels below the root; that of the items.
+    int depth() const { return (rootShift_ - itemShift_) / 3; }
+    /// log2 of the edge of the regions of a level, in voxels; and all of them.
+    int shiftAt(int level) const { return rootShift_ - 3 * level; }
+    Lattice lattice(int level) const {
+        Lattice all;
+        all.size = powerOfTwo(shiftAt(level));
+        for (size_t a = 0; a < 3; ++a) {
+            all.first[a] = rootLo_[a] << 3 * level;
+            all.extent[a] = static_cast<int32_t>(rootSize_[a] << 3 * level);
+        }
+        return all;
+    }
+    /// The entry of a cell of such a lattice, or of what is larger and holds it.
+    TRACK_APART Entry entryAt(int level, int32_t x, int32_t y, int32_t z) const {
+        int shift = 3 * level;
+        Entry entry = root_[static_cast<size_t>(
+            ((x >> shift) * rootSize_[1] + (y >> shift)) * rootSize_[2] + (z >> shift))];
+        while (shift > 0 && (entry & kNodeFlag)) {
+            shift -= 3;
+            entry = child(entry, childIndex(x >> shift, y >> shift, z >> shift));
+        }
+        return entry;
+    }
     bool empty() const { return root_.empty(); }
     size_t bytes() const {
         return root_.capacity() * sizeof(Entry) + nodes_.capacity() * sizeof(Node) +
@@ -241,6 +266,30 @@ class SparseTable {
         return result;
     }
 
+    /// For tables that only rays and points are looked for in: the same table, as a root alone
+    /// where that stays in cache and is not nearly empty. To find an item is then one step.
+    SparseTable flattened() && {
+        constexpr uint64_t kMostItems = 1 << 17;
+        constexpr uint64_t kMostPerOccupied = 64;
+        const int levels = depth();
+        const auto items = static_cast<double>(root_.size()) * std::ldexp(1.0, 9 * levels);
+        if (levels == 0 || items > static_cast<double>(kMostItems) ||
+            items > static_cast<double>(kMostPerOccupied * occupiedItems())) {
+            return std::move(*this);
+        }
+        SparseTable flat;
+        flat.itemShift_ = flat.rootShift_ = itemShift_;
+        for (size_t a = 0; a < 3; ++a) {
+            flat.rootLo_[a] = rootLo_[a] << 3 * levels;
+            flat.rootSize_[a] = rootSize_[a] << 3 * levels;
+        }
+        flat.root_.reserve(static_cast<size_t>(items));
+        flat.forEachRootRegion([&](size_t, const Int3& origin) {
+            flat.root_.push_back(find(origin[0], origin[1], origin[2]).entry);
+        });
+        return flat;
+    }
+
     /// As find's `step`: the node found is the last on the way that is as large as 2^minShift.
     static constexpr int kWhole = 3;
 
@@ -266,6 +315,13 @@ class SparseTable {
 
     /// Says that find will be asked for the entry at a point.
     void prefetch(int64_t x, int64_t y, int64_t z) const {
+        if (depth() == 0) {
+            const Int3 at{{x >> rootShift_, y >> rootShift_, z >> rootShift_}};
+            __builtin_prefetch(&root_[static_cast<size_t>(
+                ((at[0] - rootLo_[0]) * rootSize_[1] + at[1] - rootLo_[1]) * rootSize_[2] + at[2] -
+                rootLo_[2])]);
+            return;
+        }
         const Found found = find(x, y, z, rootShift_);
         if ((found.entry & kNodeFlag) && (found.entry & kLinkFlag) == 0) {
             __builtin_prefetch(&nodes_[found.entry & kIndexMask][childIndex(

@@ -9,6 +9,7 @@
 #include "io/sidecar.h"
 #include "io/sidecar_schema.h"
 #include "io/vdb_file.h"
+#include "kernel.h"
 
 #include <nlohmann/json.hpp>
 
@@ -65,6 +66,7 @@ void addValues(const std::string& path, const trk::VdbEntry& entry, Json& json) 
         json["openvdb_bytes"] = density.summary.gridBytes;
         json["brick_bytes"] = density.field.bytes();
         json["bricks"] = density.field.brickCount();
+        json["kernel"] = trk::kernelName();
         json["brick_storage"] = density.field.isHalf() ? "half" : "float";
         json["can_be_baked"] = true;
     } catch (const trk::Error& e) {
@@ -314,6 +316,7 @@ void printGrid(const Json& grid) {
         printRow("memory", byteCount(grid["brick_bytes"]) + " as " +
                                grid["brick_storage"].get<std::string>() + " bricks, " +
                                byteCount(grid["openvdb_bytes"]) + " in OpenVDB");
+        printRow("kernel", grid["kernel"].get<std::string>() + ", which queries run here");
     }
     if (grid.contains("estimate")) {
         const Json& e = grid["estimate"];

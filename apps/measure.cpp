@@ -86,7 +86,7 @@ vdbtools::SweepOptions sweepOptionsOf(const Arguments& arguments) {
         sizes.push_back(static_cast<int>(size));
     }
     options.ways =
-        vdbtools::sweepWays(choiceList(arguments, "method", vdbtools::kMethodNames), kinds,
+        vdbtools::sweepWays(choiceList(arguments, "method", vdbtools::methodNames()), kinds,
                             choiceList(arguments, "choice", vdbtools::kChoiceNames), sizes,
                             positiveList(arguments, "rate", "", 0));
     if (options.ways.empty()) {
@@ -136,8 +136,7 @@ trk::BakeOptions bakeForScattering(const vdbtools::Sweep& sweep) {
     }
     for (const vdbtools::Ranked& ranked : vdbtools::rank(sweep, sets, 0.01)) {
         const vdbtools::Way& way = ranked.way;
-        if (way.method == TRK_METHOD_RESIDUAL && way.choice == TRK_CHOICE_ROBUST && way.size > 0 &&
-            way.rate == 1) {
+        if (way.usesChoice() && way.choice == TRK_CHOICE_ROBUST && way.size > 0 && way.rate == 1) {
             options.superVoxelSize = way.size;
             options.kind = way.kind;
             break;

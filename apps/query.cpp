@@ -100,9 +100,9 @@ void noteUnknown(const Unknown& unknown, const TrkQuery& query) {
     }
     std::cerr << "vdbtrack: note: " << unknown.rays
               << (unknown.rays == 1 ? " ray has" : " rays have") << " no standard error: ";
-    if (query.method == TRK_METHOD_CONTROL || query.method == TRK_METHOD_MARCH) {
-        std::cerr << vdbtools::kMethodNames[static_cast<size_t>(query.method)]
-                  << " is biased, by an amount that only --method exact tells\n";
+    const trk::MethodTraits& method = trk::traitsOf(query.method);
+    if (!method.isUnbiased) {
+        std::cerr << method.name << " is biased, by an amount that only --method exact tells\n";
         return;
     }
     if (query.samples == 1) {
@@ -111,7 +111,7 @@ void noteUnknown(const Unknown& unknown, const TrkQuery& query) {
     }
     std::cerr << "all " << query.samples << " samples agree";
     // Of estimates between 0 and 1, more than the share that is not 0 cannot get through.
-    if (unknown.dark > 0 && query.method == TRK_METHOD_RATIO && query.rate >= 1 &&
+    if (unknown.dark > 0 && method.usesRoulette && !method.usesControl && query.rate >= 1 &&
         query.rateBase == TRK_RATE_BASE_MAJORANT) {
         char bound[32];
         std::snprintf(bound, sizeof(bound), "%.2g", 1 - std::pow(0.05, 1.0 / query.samples));
@@ -166,7 +166,7 @@ std::string table(const Arguments& arguments, size_t channels, const TrkQuery& q
 /// By the C API; standard errors are what the samples show.
 std::string transmittances(const Arguments& arguments, const track::Volume& volume,
                            track::Query query, const std::vector<TrkRay>& rays) {
-    const bool hasDepth = query.method == TRK_METHOD_EXACT || query.method == TRK_METHOD_CONTROL;
+    const bool hasDepth = !trk::traitsOf(query.method).isRandom;
     return table(
         arguments, volume.info().channels, query, rays,
         [&](size_t begin, size_t count, Answers& answers) {
@@ -230,19 +230,19 @@ track::Query queryOf(const Arguments& arguments) {
     const bool freePaths = arguments.flag("free-paths");
     query.method = freePaths && !arguments.given("method")
                        ? TRK_METHOD_RESIDUAL
-                       : choiceIndex("method", method, vdbtools::kMethodNames);
+                       : choiceIndex("method", method, vdbtools::methodNames());
     const auto needs = [&](const char* option, bool holds, const char* what) {
         if (arguments.given(option) && !holds) {
             throw UsageError("--" + std::string(option) + ": of no use with " +
                              (freePaths ? "--free-paths" : "--method " + method) + "; " + what);
         }
     };
-    const bool tracksRatios =
-        !freePaths && (query.method == TRK_METHOD_RESIDUAL || query.method == TRK_METHOD_RATIO);
-    const bool tracks = tracksRatios || freePaths || query.method == TRK_METHOD_DELTA;
-    const bool isRandom = tracks || query.method == TRK_METHOD_MARCH;
-    needs("level", query.method == TRK_METHOD_CONTROL, "only control has levels");
-    needs("step", query.method == TRK_METHOD_MARCH, "only march takes steps");
+    const trk::MethodTraits& traits = trk::traitsOf(query.method);
+    const bool tracksRatios = !freePaths && traits.usesRoulette;
+    const bool tracks = freePaths || traits.usesRate;
+    const bool isRandom = freePaths || traits.isRandom;
+    needs("level", traits.hasLevels(), "only control has levels");
+    needs("step", traits.usesSteps(), "only march takes steps");
     needs("rate-base", tracksRatios, "only residual and ratio have one");
     needs("samples", isRandom && !freePaths,
           freePaths ? "each ray of the file gets one path" : "only random methods take samples");
@@ -251,7 +251,7 @@ track::Query queryOf(const Arguments& arguments) {
                     : "only residual, ratio and delta have a variance to choose by");
     needs("rate", tracks, "only residual, ratio, delta and free paths have one");
     needs("global", tracks, "only residual, ratio, delta and free paths walk over super-voxels");
-    needs("choice", query.method == TRK_METHOD_RESIDUAL && !freePaths, "only residual has one");
+    needs("choice", traits.usesChoice() && !freePaths, "only residual has one");
     needs("roulette", tracksRatios, "only residual and ratio have one");
     needs("seed", isRandom, "nothing is random");
     needs("stream", isRandom, "nothing is random");
@@ -263,7 +263,7 @@ track::Query queryOf(const Arguments& arguments) {
     if (arguments.has("error") && !(arguments.get<float>("error") > 0)) {
         throw UsageError("--error: expected a number > 0");
     }
-    if (freePaths && query.method != TRK_METHOD_RESIDUAL && query.method != TRK_METHOD_DELTA) {
+    if (freePaths && !traits.hasFreePaths) {
         throw UsageError(
             "--free-paths: expected --method residual (decomposition tracking) or "
             "delta, found " +
@@ -276,7 +276,7 @@ track::Query queryOf(const Arguments& arguments) {
                         ? static_cast<uint32_t>(kMostForError)
                         : static_cast<uint32_t>(samples);
     query.rate = arguments.get<float>("rate");
-    const bool needsMajorant = freePaths || query.method == TRK_METHOD_DELTA;
+    const bool needsMajorant = freePaths || (traits.usesRate && !traits.usesRoulette);
     if (!(query.rate > 0) || !std::isfinite(query.rate) || (needsMajorant && query.rate < 1)) {
         throw UsageError(needsMajorant
                              ? "--rate: expected a finite number >= 1, as this needs a majorant"
@@ -333,9 +333,9 @@ uint32_t repairBeside(const std::string& sidecar) {
 Inputs inputsOf(const Arguments& arguments, const TrkQuery& query,
                 const TrkVolumeOptions& options) {
     Inputs inputs{arguments.text("IN.vdb"), arguments.text("sidecar"), options};
-    const bool densityAlone = query.method == TRK_METHOD_EXACT || query.method == TRK_METHOD_MARCH;
+    const bool densityAlone = !trk::traitsOf(query.method).usesSuperVoxels;
     if (std::filesystem::exists(inputs.density) && trk::isSidecar(inputs.density)) {
-        if (query.method != TRK_METHOD_CONTROL) {
+        if (trk::traitsOf(query.method).usesDensity) {
             throw trk::Error(TRK_ERROR_NO_DENSITY,
                              inputs.density +
                                  ": is a sidecar; expected the density it was baked "
@@ -391,8 +391,7 @@ trk::Volume openInside(const Inputs& inputs) {
 std::string answerRays(const Arguments& arguments, const track::Query& query, const Inputs& inputs,
                        const std::vector<TrkRay>& rays) {
     const bool hasFormula = !arguments.flag("free-paths") && !arguments.flag("roulette") &&
-                            query.method != TRK_METHOD_EXACT &&
-                            query.method != TRK_METHOD_CONTROL && query.method != TRK_METHOD_MARCH;
+                            trk::traitsOf(query.method).usesRate;
     if (hasFormula) {
         return certainTransmittances(arguments, openInside(inputs), query, rays);
     }

@@ -3,13 +3,20 @@
 // track.h.
 #pragma once
 
+#include "query/methods.h"
+
 #include <string>
 #include <vector>
 
 namespace vdbtools {
 
-inline const std::vector<std::string> kMethodNames{"exact",   "residual", "ratio",
-                                                   "control", "delta",    "march"};
+inline std::vector<std::string> methodNames() {
+    std::vector<std::string> names;
+    for (const trk::MethodTraits& method : trk::kMethods) {
+        names.emplace_back(method.name);
+    }
+    return names;
+}
 inline const std::vector<std::string> kChoiceNames{"robust", "mean", "min", "max"};
 
 }  // namespace vdbtools

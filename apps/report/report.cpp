@@ -36,9 +36,9 @@ ordered_json fieldsOf(const Report& report, const SweepRow& row) {
     fields["rays"] = set.rays == vdbtools::RayKind::kCamera ? "camera" : "secondary";
     fields["coloured"] = set.coloured;
     fields["depth"] = set.depth > 0 ? ordered_json(set.depth) : ordered_json("own");
-    fields["method"] = vdbtools::kMethodNames[static_cast<size_t>(way.method)];
+    fields["method"] = way.traits().name;
     fields["control"] = way.usesControl() ? ordered_json(trk::controlName(way.kind)) : nullptr;
-    fields["choice"] = way.method == TRK_METHOD_RESIDUAL
+    fields["choice"] = way.usesChoice()
                            ? ordered_json(vdbtools::kChoiceNames[static_cast<size_t>(way.choice)])
                            : nullptr;
     fields["size"] = !way.usesSuperVoxels()          ? ordered_json(nullptr)
@@ -46,8 +46,7 @@ ordered_json fieldsOf(const Report& report, const SweepRow& row) {
                                                      : ordered_json(way.size);
     fields["rate"] =
         way.isRandom() && way.usesSuperVoxels() ? ordered_json(way.rate) : ordered_json(nullptr);
-    fields["step"] =
-        way.method == TRK_METHOD_MARCH ? ordered_json(way.rate) : ordered_json(nullptr);
+    fields["step"] = way.traits().usesSteps() ? ordered_json(way.rate) : ordered_json(nullptr);
     fields["time_ns"] = number(row.nanoseconds);
     fields["time_spread"] = number(row.spread);
     fields["lookups"] = number(row.lookups);
@@ -99,7 +98,7 @@ ordered_json scatteringJson(const Scattering& scattering) {
     json["reference_samples"] = scattering.referenceSamples;
     for (const ScatterMethod& m : scattering.methods) {
         ordered_json method;
-        method["shadow_rays"] = vdbtools::kMethodNames[static_cast<size_t>(m.method)];
+        method["shadow_rays"] = trk::traitsOf(m.method).name;
         method["lookups"] = m.lookups;
         method["shadow_lookups"] = m.shadowLookups;
         method["time_ns"] = m.nanoseconds;

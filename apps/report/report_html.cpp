@@ -334,8 +334,8 @@ void addScattering(std::ostream& out, const Scattering& scattering) {
         return cell(p.rmse, digits(p.rmse) + " (" + digits(p.shadowRmse) + ")");
     };
     for (const ScatterMethod& m : scattering.methods) {
-        out << "<tr><td>" << vdbtools::kMethodNames[static_cast<size_t>(m.method)] << "</td>"
-            << cell(m.lookups) << cell(m.shadowLookups) << cell(m.nanoseconds)
+        out << "<tr><td>" << trk::traitsOf(m.method).name << "</td>" << cell(m.lookups)
+            << cell(m.shadowLookups) << cell(m.nanoseconds)
             << cell(m.spread, format("%.0f %%", 50 * m.spread)) << errors(m.sameSamples)
             << cell(m.equalLookups.samples) << errors(m.equalLookups) << cell(m.equalTime.samples)
             << errors(m.equalTime) << "</tr>\n";
@@ -345,7 +345,7 @@ void addScattering(std::ostream& out, const Scattering& scattering) {
         out << "<h3>" << title << "</h3>\n<div class=\"pictures\">\n";
         for (const ScatterMethod& m : scattering.methods) {
             const ScatterPicture& p = m.*which;
-            const std::string name = vdbtools::kMethodNames[static_cast<size_t>(m.method)];
+            const std::string name = trk::traitsOf(m.method).name;
             out << "<figure>" << imageTag(p.image, Tone::kRolledOff, name) << "<figcaption>" << name
                 << ", " << p.samples << " paths: RMSE " << digits(p.rmse)
                 << "</figcaption></figure>\n";

@@ -4,8 +4,10 @@
 
 #include "api_structs.h"
 #include "failure.h"
+#include "kernel.h"
 #include "parallel.h"
 #include "progress.h"
+#include "query/methods.h"
 #include "query/sampling.h"
 #include "query/transmittance.h"
 #include "volume.h"
@@ -59,6 +61,21 @@ TrkStatus guard(const Body& body) noexcept {
     } catch (...) {
         return fail(TRK_ERROR_UNKNOWN, "an exception that is not a std::exception");
     }
+}
+
+/// Refuses a query whose method is none of those wanted, which it names.
+template <class Wanted>
+void requireMethod(const TrkQuery& query, const char* fault, const Wanted& wanted) {
+    if (wanted(trk::traitsOf(query.method))) {
+        return;
+    }
+    std::string expected;
+    for (const trk::MethodTraits& method : trk::kMethods) {
+        if (wanted(method)) {
+            expected += (expected.empty() ? "" : " or ") + std::string(method.constant);
+        }
+    }
+    refuse("method " + std::to_string(query.method) + " " + fault + "; expected " + expected);
 }
 
 /// Runs `body` with as many threads (0: all), apart from the caller's own tasks, and tells
@@ -228,6 +245,7 @@ TrkStatus trkGetVolumeInfo(const TrkVolume* handle, TrkVolumeInfo* info) {
         result.gridName = volume.grid.name.c_str();
         result.controlKind = "";
         result.storage = !volume.hasDensity() ? "" : volume.field->isHalf() ? "half" : "float";
+        result.kernel = trk::kernelName();
         if (volume.hasSuperVoxels) {
             result.superVoxelSize = static_cast<uint32_t>(volume.superVoxels.size());
             result.superVoxelCount = volume.superVoxels.count();
@@ -264,11 +282,8 @@ TrkStatus trkIntegrateOpticalDepth(const TrkVolume* volume, const TrkQuery* quer
     return guard([&] {
         checkPointers(volume, rays, rayCount, opticalDepth);
         const TrkQuery complete = trk::checkedQuery(query, TRK_METHOD_EXACT);
-        if (complete.method != TRK_METHOD_EXACT && complete.method != TRK_METHOD_CONTROL) {
-            refuse("method " + std::to_string(complete.method) +
-                   " is random and has no optical depth; expected TRK_METHOD_EXACT or "
-                   "TRK_METHOD_CONTROL");
-        }
+        requireMethod(complete, "is random and has no optical depth",
+                      [](const trk::MethodTraits& method) { return !method.isRandom; });
         if (rayCount == 0) {
             return;
         }
@@ -283,10 +298,8 @@ TrkStatus trkSampleFreePath(const TrkVolume* volume, const TrkQuery* query, cons
     return guard([&] {
         checkPointers(volume, rays, rayCount, paths);
         const TrkQuery complete = trk::checkedQuery(query, TRK_METHOD_RESIDUAL);
-        if (complete.method != TRK_METHOD_RESIDUAL && complete.method != TRK_METHOD_DELTA) {
-            refuse("method " + std::to_string(complete.method) +
-                   " has no free paths; expected TRK_METHOD_RESIDUAL or TRK_METHOD_DELTA");
-        }
+        requireMethod(complete, "has no free paths",
+                      [](const trk::MethodTraits& method) { return method.hasFreePaths; });
         if (complete.rate < 1) {
             refuse("rate is " + std::to_string(complete.rate) +
                    "; expected at least 1, as free paths need a majorant");

@@ -2,6 +2,7 @@
 #include "api_structs.h"
 
 #include "failure.h"
+#include "query/methods.h"
 
 #include <algorithm>
 #include <cmath>
@@ -186,12 +187,13 @@ TrkDensity checkedDensity(const TrkDensity& given) {
     return density;
 }
 
-TrkQuery checkedQuery(const TrkQuery* given, TrkMethod method) {
+TrkQuery checkedQuery(const TrkQuery* given, TrkMethod byDefault) {
     TrkQuery query = given ? completed(*given, "TrkQuery", kFirstQuery) : trkDefaultQuery();
     if (!given) {
-        query.method = method;
+        query.method = byDefault;
     }
-    if (query.method < TRK_METHOD_EXACT || query.method > TRK_METHOD_MARCH) {
+    const MethodTraits* method = findMethod(query.method);
+    if (!method) {
         refuse("method is " + std::to_string(query.method) + "; expected a TRK_METHOD_ constant");
     }
     if (query.samples == 0) {
@@ -200,7 +202,7 @@ TrkQuery checkedQuery(const TrkQuery* given, TrkMethod method) {
     if (!(query.rate > 0) || !std::isfinite(query.rate)) {
         refuse("rate is " + std::to_string(query.rate) + "; expected a finite number > 0");
     }
-    if (query.method == TRK_METHOD_DELTA && query.rate < 1) {
+    if (method->usesRate && !method->usesRoulette && query.rate < 1) {
         refuse("rate is " + std::to_string(query.rate) +
                "; expected at least 1, as delta tracking needs a majorant");
     }

@@ -22,7 +22,7 @@ constexpr size_t kAbsurd = 1 << 16;
 
 // Where the structs of the first release, 0.1, end: their last fields. These never change, and none
 // leaves padding at its end, which a field of a later release might take for itself.
-constexpr size_t kFirstVolumeInfo = offsetof(TrkVolumeInfo, storage) + sizeof(const char*);
+constexpr size_t kFirstVolumeInfo = offsetof(TrkVolumeInfo, kernel) + sizeof(const char*);
 
 /// A stride of 0 or of whole, properly aligned entries.
 template <class T>

@@ -168,7 +168,7 @@ TEST(Host, StructsAreFullOfFields) {
     EXPECT_EQ(sizeof(TrkDensity), offsetof(TrkDensity, tileActive) + sizeof(void*));
     EXPECT_EQ(sizeof(TrkQuery), offsetof(TrkQuery, resultStride) + sizeof(size_t));
     EXPECT_EQ(offsetof(TrkQuery, seed), offsetof(TrkQuery, threads) + sizeof(int32_t));
-    EXPECT_EQ(sizeof(TrkVolumeInfo), offsetof(TrkVolumeInfo, storage) + sizeof(const char*));
+    EXPECT_EQ(sizeof(TrkVolumeInfo), offsetof(TrkVolumeInfo, kernel) + sizeof(const char*));
     TrkVolumeOptions options = trkDefaultVolumeOptions();
     options.noBake = 2;
     TrkVolume* volume = nullptr;

@@ -57,6 +57,7 @@ case_kernels() {
     baked_cloud
     some_rays
     local method
+    TRACK_KERNEL=baseline "$vdbtrack" info --values cloud.vdb | grep -q 'kernel *baseline' || fail "info names no kernel"
     for method in exact residual ratio control; do
         for kernel in baseline best; do
             TRACK_KERNEL=$kernel "$vdbtrack" query cloud.vdb --rays rays.csv --method $method >$kernel.csv ||

@@ -3,6 +3,7 @@
 
 #include "estimate/ratio_tracking.h"
 #include "query/batch.h"
+#include "query/methods.h"
 #include "query/variant.h"
 #include "sweep_rays.h"
 
@@ -137,7 +138,7 @@ std::array<double, 3> predictVariance(const Volume& volume, const TrkQuery& quer
         }
         return result;
     }
-    const bool residual = query.method == TRK_METHOD_RESIDUAL;
+    const bool residual = trk::traitsOf(query.method).usesControl;
     trk::withVariant(
         volume, residual ? volume.tracked().kind() : ControlKind::kConstant, [&](auto variant) {
             using V = decltype(variant);
@@ -154,7 +155,7 @@ std::array<double, 3> predictVariance(const Volume& volume, const TrkQuery& quer
 PredictedCost predictCost(const Volume& volume, const TrkQuery& query, const TrkRay& ray) {
     PredictedCost cost;
     if (const auto clipped = volume.clip(ray, volume.field->box())) {
-        const bool residual = query.method == TRK_METHOD_RESIDUAL;
+        const bool residual = trk::traitsOf(query.method).usesControl;
         trk::withVariant(
             volume, residual ? volume.tracked().kind() : ControlKind::kConstant, [&](auto variant) {
                 using V = decltype(variant);

@@ -17,7 +17,7 @@ namespace {
 
 /// Less is simpler: no bake, a smaller sidecar, defaults (which `--global` is not).
 auto complexity(const Way& way) {
-    const bool control = way.method == TRK_METHOD_RESIDUAL;
+    const bool control = way.usesChoice();
     const int kind = !control                                  ? 0
                      : way.kind == trk::ControlKind::kConstant ? 0
                      : way.kind == trk::ControlKind::kAffine   ? 1
@@ -82,15 +82,15 @@ std::string bakeOptionsOf(const Way& way) {
     if (!way.usesSuperVoxels()) {
         return "";
     }
-    const bool control = way.method == TRK_METHOD_RESIDUAL;
+    const bool control = way.usesChoice();
     const int size = way.size > 0 ? way.size : 16;
     return "--size " + std::to_string(size) + " --control " +
            (control ? trk::controlName(way.kind) : "constant");
 }
 
 std::string queryOptionsOf(const Way& way) {
-    std::string options = "--method " + kMethodNames[static_cast<size_t>(way.method)];
-    if (way.method == TRK_METHOD_RESIDUAL && way.choice != TRK_CHOICE_ROBUST) {
+    std::string options = std::string("--method ") + way.traits().name;
+    if (way.usesChoice() && way.choice != TRK_CHOICE_ROBUST) {
         options += " --choice " + kChoiceNames[static_cast<size_t>(way.choice)];
     }
     if (way.size == Way::kWholeVolume) {

@@ -80,8 +80,7 @@ class Volumes {
         }
         // Ratio and delta tracking do not look at the control, nor the control method at the
         // choice.
-        const TrkChoice choice =
-            way.method == TRK_METHOD_RESIDUAL ? way.choice : TrkChoice{TRK_CHOICE_ROBUST};
+        const TrkChoice choice = way.usesChoice() ? way.choice : TrkChoice{TRK_CHOICE_ROBUST};
         const auto key = std::make_tuple(way.size, way.kind, choice);
         const auto found = volumes_.find(key);
         if (found != volumes_.end()) {
@@ -126,7 +125,7 @@ TrkQuery queryOf(const Way& way, uint64_t seed, uint64_t stream) {
     query.rayStride = sizeof(TrkRay);
     query.seed = seed;
     query.stream = stream;
-    if (way.method == TRK_METHOD_MARCH) {
+    if (way.traits().usesSteps()) {
         query.step = static_cast<float>(way.rate);
     } else {
         query.rate = static_cast<float>(way.rate);
@@ -241,7 +240,7 @@ class SetRun {
             }
             return sum;
         }
-        if (way.method != TRK_METHOD_RESIDUAL && way.method != TRK_METHOD_RATIO) {
+        if (!way.traits().usesRoulette) {
             sum.fill(way.isRandom() ? kNaN : 0.0);
             return sum;
         }
@@ -316,8 +315,7 @@ class SetRun {
         const Tally::Channel& channel = tallies_[w].channels[c];
         const auto rayCount = static_cast<double>(rays_.size());
         const double estimates = rayCount * options_.rounds;
-        const TrkMethod method = options_.ways[w].method;
-        const bool roulette = method == TRK_METHOD_RESIDUAL || method == TRK_METHOD_RATIO;
+        const bool roulette = options_.ways[w].traits().usesRoulette;
         const double variance = std::fmax(channel.squares / estimates,
                                           predicted + (roulette ? rouletteVariance_[c] : 0));
         // Results are floats, whose rounding repeats in every round.

@@ -17,11 +17,11 @@ bool operator==(const Way& a, const Way& b) {
 }
 
 std::string nameOf(const Way& way) {
-    std::string name = kMethodNames[static_cast<size_t>(way.method)];
+    std::string name = way.traits().name;
     if (way.usesControl()) {
         name += std::string(", ") + trk::controlName(way.kind);
     }
-    if (way.method == TRK_METHOD_RESIDUAL) {
+    if (way.usesChoice()) {
         name += " " + kChoiceNames[static_cast<size_t>(way.choice)];
     }
     if (way.usesSuperVoxels()) {
@@ -29,7 +29,7 @@ std::string nameOf(const Way& way) {
             way.size == Way::kWholeVolume ? ", whole volume" : ", size " + std::to_string(way.size);
     }
     char number[40] = "";
-    if (way.method == TRK_METHOD_MARCH) {
+    if (way.traits().usesSteps()) {
         std::snprintf(number, sizeof(number), ", step %g", way.rate);
     } else if (way.isRandom()) {
         std::snprintf(number, sizeof(number), ", rate %g", way.rate);
@@ -52,7 +52,7 @@ std::vector<Way> sweepWays(const std::vector<TrkMethod>& methods,
         way.method = method;
         if (!way.usesSuperVoxels()) {
             for (const double step : {1.0, 4.0}) {
-                way.rate = method == TRK_METHOD_MARCH ? step : 1;
+                way.rate = way.traits().usesSteps() ? step : 1;
                 add(way);
             }
             continue;
@@ -64,7 +64,7 @@ std::vector<Way> sweepWays(const std::vector<TrkMethod>& methods,
                 // What is made of the whole volume is constant; ratio and delta have no control.
                 const bool constant = whole || !way.usesControl();
                 way.kind = constant ? ControlKind::kConstant : kind;
-                if (method == TRK_METHOD_CONTROL) {
+                if (!way.isRandom()) {
                     if (!whole) {
                         add(way);
                     }
@@ -78,7 +78,7 @@ std::vector<Way> sweepWays(const std::vector<TrkMethod>& methods,
                     way.choice = way.usesControl() ? choice : TrkChoice{TRK_CHOICE_ROBUST};
                     for (const double rate : rates) {
                         // A looser majorant only costs delta tracking time.
-                        way.rate = method == TRK_METHOD_DELTA ? 1 : rate;
+                        way.rate = way.traits().usesRoulette ? rate : 1;
                         add(way);
                     }
                 }

@@ -3,6 +3,7 @@
 #pragma once
 
 #include "control/control_shape.h"
+#include "query/methods.h"
 #include "track/track.h"
 
 #include <string>
@@ -20,14 +21,12 @@ struct Way {
 
     static constexpr int kWholeVolume = -1;
 
-    bool usesControl() const {
-        return method == TRK_METHOD_RESIDUAL || method == TRK_METHOD_CONTROL;
-    }
-    bool usesSuperVoxels() const {
-        return method != TRK_METHOD_EXACT && method != TRK_METHOD_MARCH;
-    }
-    bool isUnbiased() const { return method != TRK_METHOD_CONTROL && method != TRK_METHOD_MARCH; }
-    bool isRandom() const { return method != TRK_METHOD_EXACT && method != TRK_METHOD_CONTROL; }
+    const trk::MethodTraits& traits() const { return trk::traitsOf(method); }
+    bool usesControl() const { return traits().usesControl; }
+    bool usesChoice() const { return traits().usesChoice(); }
+    bool usesSuperVoxels() const { return traits().usesSuperVoxels; }
+    bool isUnbiased() const { return traits().isUnbiased; }
+    bool isRandom() const { return traits().isRandom; }
 };
 bool operator==(const Way& a, const Way& b);
 

@@ -437,6 +437,10 @@ typedef struct TrkVolumeInfo {
     const char* gridName;     /**< of the source grid */
     const char* controlKind;  /**< "constant", "trilinear" or "affine"; "" without a sidecar */
     const char* storage;      /**< "float" or "half", "" where only a sidecar is open */
+    const char* kernel;       /**< whose code queries run: "avx2", or "baseline", which every
+                                   processor has and the environment variable TRACK_KERNEL may ask
+                                   for. Results have the same bits on one kernel, and differ in the
+                                   last ones between two */
 } TrkVolumeInfo;
 
 /* ---- Volume ---------------------------------------------------------------------------------- */

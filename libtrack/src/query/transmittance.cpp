@@ -9,6 +9,7 @@
 #include "estimate/rng.h"
 #include "failure.h"
 #include "kernel.h"
+#include "methods.h"
 #include "variant.h"
 
 #include <algorithm>
@@ -24,14 +25,14 @@ namespace trk {
 namespace {
 
 void checkMethod(const Volume& volume, const TrkQuery& query) {
-    if (query.method != TRK_METHOD_CONTROL) {
+    const MethodTraits& method = traitsOf(query.method);
+    if (method.usesDensity) {
         requireDensity(volume, "; or use TRK_METHOD_CONTROL");
     }
-    if (query.method != TRK_METHOD_EXACT && query.method != TRK_METHOD_MARCH) {
-        requireSuperVoxels(volume,
-                           query.method == TRK_METHOD_CONTROL ? "" : ", or use TRK_METHOD_EXACT");
+    if (method.usesSuperVoxels) {
+        requireSuperVoxels(volume, method.usesDensity ? ", or use TRK_METHOD_EXACT" : "");
     }
-    if (query.method == TRK_METHOD_CONTROL && query.level > volume.superVoxels.levelCount()) {
+    if (method.hasLevels() && query.level > volume.superVoxels.levelCount()) {
         throw Error(TRK_ERROR_INVALID_ARGUMENT,
                     "level " + std::to_string(query.level) + ": expected 0 to " +
                         std::to_string(volume.superVoxels.levelCount()) +
@@ -39,12 +40,20 @@ void checkMethod(const Volume& volume, const TrkQuery& query) {
     }
 }
 
+/// Of the super-voxels that a query walks, where their control is looked at.
+ControlKind controlKind(const Volume& volume, const TrkQuery& query) {
+    const MethodTraits& method = traitsOf(query.method);
+    return method.usesChoice()  ? volume.tracked().kind()
+           : method.hasLevels() ? volume.superVoxels.kind()
+                                : ControlKind::kConstant;
+}
+
 /// Optical depth by a method without noise.
 template <class V>
 std::array<double, V::kChannels> deterministicDepth(const Volume& volume, const TrkQuery& query,
                                                     const TrkRay& ray, double& clippedLength,
                                                     PathCost& cost) {
-    const bool exact = query.method == TRK_METHOD_EXACT;
+    const bool exact = traitsOf(query.method).isUnbiased;
     const auto clipped =
         volume.clip(ray, exact ? volume.field->box() : volume.superVoxels.box(query.level));
     if (!clipped) {
@@ -106,7 +115,7 @@ class SampleMean {
     std::array<double, C> squares_{};
 };
 
-/// By a random method that takes one ray at a time.
+/// By a random method that takes one ray at a time: delta tracking and marching.
 template <class V>
 Estimate<V::kChannels> estimateRandomly(const Volume& volume, const TrkQuery& query,
                                         const ClippedRay& clipped, uint64_t rayId, PathCost& cost) {
@@ -147,9 +156,7 @@ class RayOutput {
     /// `clippedLength`: voxel lengths within the volume; 0 where the ray misses it.
     void write(size_t ray, Estimate<V::kChannels> estimate, const PathCost& cost,
                double clippedLength, double samples) const {
-        const bool biased =
-            query_.method == TRK_METHOD_CONTROL || query_.method == TRK_METHOD_MARCH;
-        if (biased && clippedLength > 0) {
+        if (!traitsOf(query_.method).isUnbiased && clippedLength > 0) {
             estimate.standardError.fill(kNaN);
         }
         for (size_t c = 0; c < V::kChannels; ++c) {
@@ -193,7 +200,7 @@ template <class V>
 void estimateRay(const Volume& volume, const TrkQuery& query, const TrkRay& ray, size_t i,
                  const RayOutput<V>& output) {
     PathCost cost;
-    if (query.method == TRK_METHOD_EXACT || query.method == TRK_METHOD_CONTROL) {
+    if (!traitsOf(query.method).isRandom) {
         double clippedLength = 0;
         const auto depth = deterministicDepth<V>(volume, query, ray, clippedLength, cost);
         Estimate<V::kChannels> estimate{};
@@ -201,11 +208,14 @@ void estimateRay(const Volume& volume, const TrkQuery& query, const TrkRay& ray,
             estimate.mean[c] = std::exp(-depth[c]);
         }
         output.write(i, estimate, cost, clippedLength, 1);
-    } else if (const auto clipped = volume.clip(ray, volume.field->box())) {
-        const auto estimate = estimateRandomly<V>(volume, query, *clipped, rayIdAt(query, i), cost);
-        output.write(i, estimate, cost, clipped->local.tEnd, query.samples);
-    } else {
-        output.writeMiss(i);
+    } else if constexpr (V::kKind == ControlKind::kConstant) {
+        if (const auto clipped = volume.clip(ray, volume.field->box())) {
+            const auto estimate =
+                estimateRandomly<V>(volume, query, *clipped, rayIdAt(query, i), cost);
+            output.write(i, estimate, cost, clipped->local.tEnd, query.samples);
+        } else {
+            output.writeMiss(i);
+        }
     }
 }
 
@@ -320,14 +330,19 @@ void estimateByFlights(const Volume& volume, const TrkQuery& query, const TrkRay
 template <class V>
 void estimateRange(const Volume& volume, const TrkQuery& query, const TrkRay* rays, size_t begin,
                    size_t end, const RayOutput<V>& output) {
-    if (query.method == TRK_METHOD_RESIDUAL) {
+    const MethodTraits& method = traitsOf(query.method);
+    if (method.usesRoulette && method.usesControl) {
         estimateByFlights<V, ResidualControl>(volume, query, rays, begin, end, output);
-    } else if (query.method == TRK_METHOD_RATIO) {
-        estimateByFlights<V, NoControl>(volume, query, rays, begin, end, output);
-    } else {
-        for (size_t i = begin; i < end; ++i) {
-            estimateRay(volume, query, rayAt(query, rays, i), i, output);
+        return;
+    }
+    if constexpr (V::kKind == ControlKind::kConstant) {  // or none is looked at: see controlKind
+        if (method.usesRoulette) {
+            estimateByFlights<V, NoControl>(volume, query, rays, begin, end, output);
+            return;
         }
+    }
+    for (size_t i = begin; i < end; ++i) {
+        estimateRay(volume, query, rayAt(query, rays, i), i, output);
     }
 }
 #ifdef TRACK_AVX2
@@ -350,9 +365,7 @@ void estimateTransmittance(const Volume& volume, const TrkQuery& query, const Tr
                            const StatisticsOutput& statistics) {
     checkMethod(volume, query);
     checkRays(query, rays, rayCount);
-    const ControlKind kind = query.method == TRK_METHOD_RESIDUAL  ? volume.tracked().kind()
-                             : query.method == TRK_METHOD_CONTROL ? volume.superVoxels.kind()
-                                                                  : ControlKind::kConstant;
+    const ControlKind kind = controlKind(volume, query);
     withVariant(volume, kind, [&](auto variant) {
         using V = decltype(variant);
         const RayOutput<V> output(volume, query, transmittance, statistics);
@@ -372,8 +385,7 @@ void integrateOpticalDepth(const Volume& volume, const TrkQuery& query, const Tr
                            size_t rayCount, const Array<double>& opticalDepth) {
     checkMethod(volume, query);
     checkRays(query, rays, rayCount);
-    const ControlKind kind =
-        query.method == TRK_METHOD_CONTROL ? volume.superVoxels.kind() : ControlKind::kConstant;
+    const ControlKind kind = controlKind(volume, query);
     withVariant(volume, kind, [&](auto variant) {
         using V = decltype(variant);
         forEachRay(query, rayCount, [&](size_t i) {

@@ -19,6 +19,7 @@ template <size_t F, size_t C, ControlKind K>
 struct Variant {
     static constexpr size_t kDensityChannels = F;
     static constexpr size_t kChannels = C;
+    static constexpr ControlKind kKind = K;
     using Extinction = VolumeExtinction<F, C>;
 
     /// The volume's super-voxels as estimators walk them.

@@ -99,12 +99,17 @@ class Throughput {
     /// Whether the walk goes on. Sets `isRandom` where that was left to chance.
     template <class Random>
     bool survives(Random& random, bool& isRandom) {
-        if (matters()) {
+        return survives(opticalDepth_, random, isRandom);
+    }
+    /// The same, were this the optical depth.
+    template <class Random>
+    bool survives(const std::array<double, C>& depth, Random& random, bool& isRandom) {
+        if (matters(depth)) {
             return true;
         }
         double largest = 0;
         for (size_t c = 0; c < C; ++c) {
-            largest = std::max(largest, std::fabs(value(c)));
+            largest = std::max(largest, std::fabs(products_[c].timesExp(depth[c])));
         }
         const double probability = largest / kRouletteThreshold;
         isRandom = true;
@@ -274,22 +279,29 @@ class RatioWalk {
     /// Begins with the super-voxel at hand, unless what is left is to be weighed first, or to end.
     bool enter() {
         const double base = rateOf(superVoxel_);
-        // Where the super-voxel is homogeneous, walks do not end.
-        if (settings_.roulette && base > 0 && !sofar_.matters()) {
-            if (count_ > 0) {
-                return false;
-            }
-            if (!sofar_.survives(random_, cost_.random)) {
-                return false;
-            }
-        }
-        hasNext_ = false;
-        ++cost_.superVoxels;
         const double length = tExit_ - tEnter_;
         rate_ = base * settings_.rate;
         ratePerVoxel_ = rate_ * settings_.lengthPerVoxel;
         remaining_ = ratePerVoxel_ * length;
-        if (remaining_ > mostLookups(length)) {
+        const bool isExact = remaining_ > mostLookups(length);
+        // Where the super-voxel is homogeneous, walks do not end.
+        if (settings_.roulette && base > 0) {
+            std::array<double, C> depth = sofar_.opticalDepth();
+            for (size_t c = 0; c < C; ++c) {
+                depth[c] += settings_.lengthPerVoxel * leastDepth(c, isExact);
+            }
+            if (!sofar_.matters(depth)) {
+                if (count_ > 0) {
+                    return false;
+                }
+                if (!sofar_.survives(depth, random_, cost_.random)) {
+                    return false;
+                }
+            }
+        }
+        hasNext_ = false;
+        ++cost_.superVoxels;
+        if (isExact) {
             uint64_t bricks = 0;
             const auto exact = field_.integrate(ray_, tEnter_, tExit_, cost_.lookups, bricks);
             for (size_t c = 0; c < C; ++c) {
@@ -301,6 +313,15 @@ class RatioWalk {
         cost_.random = cost_.random || remaining_ > 0;
         isInside_ = true;
         return true;
+    }
+
+    /// Of the super-voxel at hand, in voxels: what both its optical depth and its control's have at
+    /// least. Roulette may count on it before anything is looked up: an estimate of at least that
+    /// depth makes up for the weight of the walks that go on.
+    double leastDepth(size_t c, bool isExact) const {
+        const double least = static_cast<double>(superVoxel_.range(c).min) * (tExit_ - tEnter_);
+        return isExact ? least
+                       : std::min(least, Method::integrate(superVoxel_, c, ray_, tEnter_, tExit_));
     }
 
     /// To the next collision, or out of the super-voxel. What is left of the optical distance (in

@@ -213,6 +213,38 @@ TEST(SparseTable, AWalkMeetsJustWhatIsFoundPointByPoint) {
     }
 }
 
+TEST(SparseTable, FlattenedTablesAreWalkedAlike) {
+    const SparseTable table = randomTable(200);
+    const SparseTable flat = SparseTable(table).flattened();
+    EXPECT_GT(table.depth(), 0);
+    EXPECT_EQ(flat.depth(), 0);
+    EXPECT_EQ(flat.occupiedItems(), table.occupiedItems());
+    std::mt19937_64 random(11);
+    std::uniform_real_distribution<double> unit(0, 200);
+    size_t met = 0;
+    for (int i = 0; i < 200; ++i) {
+        const Vec3d a{{unit(random), unit(random), unit(random)}};
+        const Vec3d b{{unit(random), unit(random), unit(random)}};
+        const LocalRay ray = makeRay(a, b - a, length(b - a));
+        const auto ofTable = segments(table, ray);
+        const auto ofFlat = segments(flat, ray);
+        ASSERT_EQ(ofFlat.size(), ofTable.size());
+        for (size_t k = 0; k < ofFlat.size(); ++k, ++met) {
+            ASSERT_EQ(ofFlat[k].entry, ofTable[k].entry);
+            ASSERT_EQ(ofFlat[k].lo, ofTable[k].lo);
+            ASSERT_NEAR(ofFlat[k].t0, ofTable[k].t0, 1e-10);
+            ASSERT_NEAR(ofFlat[k].t1, ofTable[k].t1, 1e-10);
+        }
+    }
+    EXPECT_GT(met, 1000u);
+    // Where little of the box is occupied, that is not worth it.
+    SparseTable corners(3, cube(256));
+    corners.assemble({{{{0, 0, 0}}, 3, 1}, {{{248, 248, 248}}, 3, 2}});
+    const SparseTable same = SparseTable(corners).flattened();
+    EXPECT_EQ(same.depth(), corners.depth());
+    EXPECT_EQ(same.find(250, 250, 250).entry, 2u);
+}
+
 TEST(SparseTable, WalkMeetsWhatDenseSamplingMeets) {
     const SparseTable table = randomTable(256);
     std::mt19937_64 random(3);

@@ -47,7 +47,7 @@ class SparseTable {
     SparseTable() = default;
 
     /// An empty table of items of 2^itemShift voxels over `box` (voxels, local, not negative).
-    SparseTable(int itemShift, const IntBox& box) : itemShift_(itemShift) {
+    SparseTable(int itemShift, const IntBox& box) : itemShift_(itemShift), rootShift_(itemShift) {
         if (box.empty()) {
             return;
         }

@@ -56,7 +56,7 @@ struct LatticeWindow {
 
     uint32_t crossed[kMost];  // planes of each axis before a cell, ten bits each
     int32_t start[3];
-    int32_t sign[3];
+    int32_t sign[3] = {0, 0, 0};
 };
 
 /// A ray's way through a lattice, which may stop anywhere and go on. A ray meets the planes of an

@@ -229,7 +229,7 @@ TrkStatus trkGetVolumeInfo(const TrkVolume* handle, TrkVolumeInfo* info) {
         TrkVolumeInfo result{};
         result.size = size;
         const trk::IntBox& box =
-            volume.hasDensity() ? volume.field->box() : volume.superVoxels.box();
+            volume.hasDensity() ? volume.field->box() : volume.superVoxels->box();
         trk::worldBounds(volume.indexToWorld, volume.anchor, box, result.boundsMin,
                          result.boundsMax);
         for (int row = 0; row < 3; ++row) {
@@ -246,11 +246,11 @@ TrkStatus trkGetVolumeInfo(const TrkVolume* handle, TrkVolumeInfo* info) {
         result.controlKind = "";
         result.storage = !volume.hasDensity() ? "" : volume.field->isHalf() ? "half" : "float";
         result.kernel = trk::kernelName();
-        if (volume.hasSuperVoxels) {
-            result.superVoxelSize = static_cast<uint32_t>(volume.superVoxels.size());
-            result.superVoxelCount = volume.superVoxels.count();
-            result.levels = static_cast<uint32_t>(volume.superVoxels.levelCount());
-            result.controlKind = trk::controlName(volume.superVoxels.kind());
+        if (volume.hasSuperVoxels()) {
+            result.superVoxelSize = static_cast<uint32_t>(volume.superVoxels->size());
+            result.superVoxelCount = volume.superVoxels->count();
+            result.levels = static_cast<uint32_t>(volume.superVoxels->levelCount());
+            result.controlKind = trk::controlName(volume.superVoxels->kind());
         }
         std::memcpy(info, &result, std::min(size, sizeof(result)));
         if (size > sizeof(result)) {  // what a newer header adds

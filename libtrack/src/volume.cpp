@@ -141,24 +141,23 @@ void addSuperVoxels(Volume& volume, BakedVolume baked, const VolumeOptions& opti
     }
     const bool constantOnly = options.choice == TRK_CHOICE_MIN || options.choice == TRK_CHOICE_MAX;
     if (options.global && volume.hasDensity()) {
-        const IntBox& box = volume.field->box();
-        Vec3d edges;
-        for (int a = 0; a < 3; ++a) {
-            const auto axis = static_cast<size_t>(a);
-            edges[a] = static_cast<double>(box.hi[axis] - box.lo[axis]);
-        }
         volume.globalSuperVoxel =
-            SuperVoxels(SuperVoxels::whole(baked, box), volume.scales, options.choice,
-                        volume.indexToWorld.longestDiagonal(edges));
+            std::make_shared<const SuperVoxels>(SuperVoxels::whole(baked, volume.field->box()));
     } else if (constantOnly && baked.kind != ControlKind::kConstant) {
         throw Error(TRK_ERROR_INVALID_ARGUMENT,
                     where + ": choice min and max are constant controls, and this sidecar's is " +
                         controlName(baked.kind) + "; expected robust or mean");
     }
-    const double size = baked.superVoxelSize();
-    volume.superVoxels = SuperVoxels(std::move(baked), volume.scales, options.choice,
-                                     volume.indexToWorld.longestDiagonal({{size, size, size}}));
-    volume.hasSuperVoxels = true;
+    volume.superVoxels = std::make_shared<const SuperVoxels>(std::move(baked));
+    Vec3d edges;
+    for (int a = 0; a < 3; ++a) {
+        const auto axis = static_cast<size_t>(a);
+        edges[a] =
+            volume.globalSuperVoxel
+                ? static_cast<double>(volume.field->box().hi[axis] - volume.field->box().lo[axis])
+                : static_cast<double>(volume.superVoxels->size());
+    }
+    volume.controlChoice = {options.choice, volume.indexToWorld.longestDiagonal(edges)};
 }
 
 void bakeInMemory(Volume& volume, const VolumeOptions& options) {

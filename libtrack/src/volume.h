@@ -2,6 +2,7 @@
 // An opened volume: everything a query reads, immutable.
 #pragma once
 
+#include "control/control_choice.h"
 #include "control/super_voxels.h"
 #include "field/density_field.h"
 #include "space/geometry.h"
@@ -75,23 +76,29 @@ struct Volume {
     std::shared_ptr<const DensityField> field;
     std::shared_ptr<const DensitySummary> density;
 
-    bool hasSuperVoxels = false;
-    SuperVoxels superVoxels;                      ///< as baked
-    std::optional<SuperVoxels> globalSuperVoxel;  ///< one over everything, where that was asked for
+    /// What was baked, which several volumes may share; NULL where nothing was.
+    std::shared_ptr<const SuperVoxels> superVoxels;
+    /// One over everything, where that was asked for.
+    std::shared_ptr<const SuperVoxels> globalSuperVoxel;
+    ControlChoice controlChoice;  ///< of those that are tracked
 
     GridIdentity grid;
     std::string sidecarPath;  ///< the sidecar, or where it was looked for
     uint64_t activeVoxels = 0;
 
     bool hasDensity() const { return field != nullptr; }
+    bool hasSuperVoxels() const { return superVoxels != nullptr; }
     size_t channels() const { return scales.size(); }
+    size_t densityChannels() const {
+        return hasDensity() ? field->channels() : superVoxels->channels();
+    }
     /// What the random methods walk over; control and levels are those of `superVoxels`.
     const SuperVoxels& tracked() const {
-        return globalSuperVoxel ? *globalSuperVoxel : superVoxels;
+        return globalSuperVoxel ? *globalSuperVoxel : *superVoxels;
     }
-
     size_t bytes() const {
-        return sizeof(*this) + (field ? field->bytes() : 0) + superVoxels.bytes() +
+        return sizeof(*this) + (field ? field->bytes() : 0) +
+               (superVoxels ? superVoxels->bytes() : 0) +
                (globalSuperVoxel ? globalSuperVoxel->bytes() : 0);
     }
 

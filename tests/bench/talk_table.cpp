@@ -44,20 +44,19 @@ struct Slab {
     Everywhere super{};
 
     Slab(double depth, double majorant, double control) : medium{1, 1, depth} {
-        super.range.max = static_cast<float>(majorant);
-        super.item.control = super.item.baked = static_cast<float>(control);
-        super.item.bound = static_cast<float>(std::max(majorant - control, control));
+        super.item.max = static_cast<float>(majorant);
+        super.item.mean = static_cast<float>(control);
     }
     Measured delta() const {
         return measure(kSamples, [&](trk::Rng& rng, trk::PathCost& cost) {
             return trk::trackBinary(medium, super, medium.ray(), plainSettings(), rng, cost)[0];
         });
     }
-    template <class Method>
+    template <trk::Control kControl>
     Measured track() const {
         return measure(kSamples, [&](trk::Rng& rng, trk::PathCost& cost) {
-            return trk::trackTransmittance<Method>(medium, super, medium.ray(), plainSettings(),
-                                                   rng, cost)[0];
+            return trk::trackTransmittance<kControl>(medium, super, medium.ray(), plainSettings(),
+                                                     rng, cost)[0];
         });
     }
 };
@@ -72,7 +71,7 @@ void printMajorants() {
         for (const double kappa : {1.0, 1.25, 2.0, 4.0, 16.0}) {
             const Slab slab(depth, kappa, 0);
             const Measured delta = slab.delta();
-            const Measured ratio = slab.track<trk::NoControl>();
+            const Measured ratio = slab.track<trk::Control::kNone>();
             const double T = std::exp(-depth);
             const double formula = depth * T * std::expm1(depth / kappa) / ((1 - T) * (1 - T));
             std::printf("| %g | %g | %.4f | %.4f | %.2f | %.2f | %.3f | %.3f |\n", depth, kappa,
@@ -93,10 +92,10 @@ void printHomogeneous() {
                         std::exp(-depth), std::max(m.variance, 0.0), m.lookups);
         };
         print("delta", Slab(depth, 1, 0).delta());
-        print("ratio", Slab(depth, 1, 0).track<trk::NoControl>());
+        print("ratio", Slab(depth, 1, 0).track<trk::Control::kNone>());
         Slab perfect(depth, 1, 1);
-        perfect.super.item.bound = 0;
-        print("residual", perfect.track<trk::ResidualControl>());
+        perfect.super.item.min = 1;  // nothing is left
+        print("residual", perfect.track<trk::Control::kChosen>());
     }
     std::printf("\n");
 }

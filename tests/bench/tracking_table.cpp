@@ -5,6 +5,7 @@
 // Rate: variance, from the formulas, of rates on the RMS over that of rates on the majorant, at
 // equal look-ups. Ends: time, variance, look-ups, measured, with and without roulette and exact
 // integration.
+#include "estimate/plan.h"
 #include "stat/test_set.h"
 #include "support/fixtures.h"
 #include "support/reference.h"
@@ -53,21 +54,24 @@ std::vector<std::vector<Stretch>> stretchesOf(const Scene& scene) {
         std::vector<Stretch> stretches;
         scene.withFields([&](auto, const auto& field, const auto& superVoxels) {
             const LocalRay& r = ray.local;
-            superVoxels.walk(r, 0, r.tEnd, [&](const auto& v, double t0, double t1) {
-                if (v[0].bound > 0) {
-                    const double squares =
-                        reference::integrateCells(r.origin, r.direction, t0, t1, [&](double t) {
+            trk::TrackingSettings settings = scene.settings(ray);
+            settings.rate = 1;
+            settings.rateBase = RateBase::kRms;
+            trk::forEachStretch<trk::Control::kChosen>(
+                superVoxels, r, settings, [&](const auto& plan, size_t i) {
+                    if (!plan.isTracked(i, 0)) {
+                        return;
+                    }
+                    const double squares = reference::integrateCells(
+                        r.origin, r.direction, plan.tEnter(i), plan.tExit(i), [&](double t) {
                             const double residual =
-                                field.extinction(r.at(t))[0] - v.control(0, r.at(t));
+                                field.extinction(r.at(t))[0] - plan.control(i, 0, r.at(t));
                             return residual * residual;
                         });
                     stretches.push_back({ray.lengthPerVoxel * squares,
-                                         ray.lengthPerVoxel * (t1 - t0),
-                                         {trk::ResidualControl::rate(v, 0, RateBase::kMajorant),
-                                          trk::ResidualControl::rate(v, 0, RateBase::kRms)}});
-                }
-                return true;
-            });
+                                         ray.lengthPerVoxel * plan.length(i),
+                                         {plan.bound(i, 0), plan.rate(i) / ray.lengthPerVoxel}});
+                });
         });
         result.push_back(std::move(stretches));
     }

@@ -2,6 +2,7 @@
 // Media whose every integral is known, for the estimators: no VDB, no bake.
 #pragma once
 
+#include "control/control_choice.h"
 #include "control/super_voxels.h"
 #include "estimate/rng.h"
 #include "estimate/tracking.h"
@@ -51,31 +52,26 @@ struct Ramp {
     LocalRay ray() const { return {{{0, 0, 0}}, {{1, 0, 0}}, {{1, 1e300, 1e300}}, length}; }
 };
 
-/// One super-voxel over everything.
+/// One super-voxel over everything, whose control is its mean.
 struct Everywhere {
+    static constexpr size_t kChannels = 1;
+    static constexpr trk::ControlKind kKind = trk::ControlKind::kConstant;
+
     SuperVoxel item;
-    trk::ExtinctionRange range;
 
-    using View = trk::SuperVoxelView<1, trk::ControlKind::kConstant>;
-
-    View view() const { return {&item, &range, nullptr, {}, 1}; }
-    template <class Visit>
-    void walk(const LocalRay& ray, double, double, Visit&& visit) const {
-        visit(view(), 0.0, ray.tEnd);
-    }
+    double scale(size_t) const { return 1; }
+    const trk::ControlChoice& choice() const { return mean; }
 
     /// As trk::SuperVoxelCursor.
     class Cursor {
       public:
-        using View = Everywhere::View;
+        static constexpr size_t kMost = 4;
 
         Cursor(const Everywhere& everywhere, double t1) : everywhere_(everywhere), t1_(t1) {}
-        bool next(View& view, double& tEnter, double& tExit) {
-            view = everywhere_.view();
-            tEnter = 0;
-            tExit = t1_;
-            return !std::exchange(done_, true);
-        }
+        size_t refill() { return std::exchange(done_, true) ? 0 : 1; }
+        double tEnter(size_t) const { return 0; }
+        double tExit(size_t) const { return t1_; }
+        const SuperVoxel& record(size_t, size_t) const { return everywhere_.item; }
 
       private:
         const Everywhere& everywhere_;
@@ -83,6 +79,8 @@ struct Everywhere {
         bool done_ = false;
     };
     Cursor cursor(const LocalRay&, double, double t1) const { return {*this, t1}; }
+
+    trk::ControlChoice mean{TRK_CHOICE_MEAN, 1};
 };
 
 struct Measured {

@@ -1,6 +1,7 @@
 // SPDX-License-Identifier: Apache-2.0
 // That the random estimators have the exact transmittance as their mean, to the standard error
 // their exact second moment gives, and that a wrong estimator would be noticed.
+#include "estimate/plan.h"
 #include "estimate/ratio_tracking.h"
 #include "estimate/rng.h"
 #include "support/fixtures.h"
@@ -191,11 +192,10 @@ TEST(Estimators, AControlDepthTwoPercentTooLargeIsRejected) {
         const Scene scene(medium, 8, wayNamed(way), 1, 300);
         const auto factor = [&](const PreparedRay& ray) {
             double depth = 0;
-            Grey::Walk{scene.volume.superVoxels}.walk(
-                ray.local, 0, ray.local.tEnd, [&](const auto& v2, double t0, double t1) {
-                    depth += ray.lengthPerVoxel * v2.integrateControl(0, ray.local, t0, t1);
-                    return true;
-                });
+            const trk::TrackingSettings settings = scene.settings(ray);
+            trk::forEachStretch<trk::Control::kChosen>(
+                Grey::Walk(scene.volume), ray.local, settings,
+                [&](const auto& plan, size_t i) { depth += plan.depth(i, 0); });
             return std::exp(-0.02 * depth);
         };
         expectRejected(
@@ -207,63 +207,59 @@ TEST(Estimators, AControlDepthTwoPercentTooLargeIsRejected) {
     }
 }
 
-/// The super-voxels of a volume, where some claim that the control leaves nothing.
+/// The super-voxels of a volume, where some claim that the control, the minimum, leaves nothing.
 struct LyingSuperVoxels {
-    const trk::SuperVoxels& truth;
+    static constexpr size_t kChannels = 1;
+    static constexpr ControlKind kKind = ControlKind::kConstant;
+    const Grey::Walk& truth;
 
     static bool lies(const trk::SuperVoxel& v) {
         uint32_t bits;
-        std::memcpy(&bits, &v.baked, sizeof(bits));
-        return v.bound > 0 && (bits >> 3 & 7) == 0;
+        std::memcpy(&bits, &v.mean, sizeof(bits));
+        return v.max > v.min && (bits >> 3 & 7) == 0;
     }
-    class Cursor {
-      public:
-        using View = trk::SuperVoxelView<1, ControlKind::kConstant>;
-
-        Cursor(const trk::SuperVoxels& truth, const LocalRay& ray, double t0, double t1)
-            : truth_(truth, ray, t0, t1) {}
-        bool next(View& view, double& tEnter, double& tExit) {
-            View v;
-            if (!truth_.next(v, tEnter, tExit)) {
-                return false;
-            }
-            item_ = v[0];
-            item_.bound = lies(item_) ? 0 : item_.bound;
-            view = View(&item_, nullptr, nullptr, {}, 1);  // constant: the same everywhere
-            return true;
+    double scale(size_t channel) const { return truth.scale(channel); }
+    const trk::ControlChoice& choice() const { return truth.choice(); }
+    struct Cursor : trk::SuperVoxelCursor<1, ControlKind::kConstant> {
+        using Truth = trk::SuperVoxelCursor<1, ControlKind::kConstant>;
+        explicit Cursor(const Truth& whole) : Truth(whole) {}
+        trk::SuperVoxel record(size_t i, size_t channel) const {
+            trk::SuperVoxel v = Truth::record(i, channel);
+            v.max = lies(v) ? v.min : v.max;
+            return v;
         }
-
-      private:
-        trk::SuperVoxelCursor<1, ControlKind::kConstant> truth_;
-        trk::SuperVoxel item_{};
     };
-    Cursor cursor(const LocalRay& ray, double t0, double t1) const { return {truth, ray, t0, t1}; }
+    Cursor cursor(const LocalRay& ray, double t0, double t1) const {
+        return Cursor(truth.cursor(ray, t0, t1));
+    }
 };
 
 TEST(Estimators, ABoundOfZeroWhereThereIsResidualIsRejected) {
     const Medium medium = mediumOf(sources().front());
     // Over many rays, residuals of a mean control cancel.
     const Scene scene(medium, 8, wayNamed("min"), 1, 300);
-    const LyingSuperVoxels lying{scene.volume.superVoxels};
+    const Grey::Walk truth(scene.volume);
+    const LyingSuperVoxels lying{truth};
     const Grey::Extinction field(scene.volume);
     expectRejected(
         scene,
         [&](const PreparedRay& ray, trk::Rng& rng) {
             trk::PathCost cost;
-            return trk::trackTransmittance<trk::ResidualControl>(field, lying, ray.local,
-                                                                 scene.settings(ray), rng, cost)[0];
+            return trk::trackTransmittance<trk::Control::kChosen>(
+                field, lying, ray.local, scene.settings(ray), rng, cost)[0];
         },
         [&](const PreparedRay& ray) {
             double untracked = 0;  // residual optical depth that nobody samples
-            Grey::Walk{scene.volume.superVoxels}.walk(
-                ray.local, 0, ray.local.tEnd, [&](const auto& v, double t0, double t1) {
-                    uint64_t ignored = 0;
-                    if (LyingSuperVoxels::lies(v[0])) {
-                        untracked += ray.lengthPerVoxel *
-                                     (field.integrate(ray.local, t0, t1, ignored, ignored)[0] -
-                                      v.integrateControl(0, ray.local, t0, t1));
+            const trk::TrackingSettings settings = scene.settings(ray);
+            trk::forEachStretch<trk::Control::kChosen>(
+                lying, ray.local, settings, [&](const auto& plan, size_t i) {
+                    if (plan.rate(i) == 0) {
+                        uint64_t ignored = 0;
+                        untracked += ray.lengthPerVoxel * field.integrate(ray.local, plan.tEnter(i),
+                                                                          plan.tExit(i), ignored,
+                                                                          ignored)[0] -
+                                     plan.depth(i, 0);
                     }
-                    return true;
                 });
             return std::exp(untracked);
         });

@@ -48,13 +48,25 @@ void expectFormulas(const std::string& name, const Ramp& medium, double min, dou
                     double control) {
     const LocalRay ray = medium.ray();
     const double T = std::exp(-medium.depth());
-    Everywhere super{};
-    super.range.min = static_cast<float>(min);
-    super.range.max = static_cast<float>(max);
-    super.item.baked = super.item.control = static_cast<float>(control);
-    super.item.bound = static_cast<float>(std::max(max - control, control - min));
-    super.range.rms = static_cast<float>(std::sqrt(medium.squares(0) / medium.length));
-    super.item.residualRms = static_cast<float>(std::sqrt(medium.squares(control) / medium.length));
+    // What is baked is the mean of the extinction; as a control, any number may be.
+    const double average = medium.depth() / medium.length;
+    const auto recordOf = [&](double mean) {
+        return Everywhere{{static_cast<float>(min), static_cast<float>(max),
+                           static_cast<float>(mean),
+                           static_cast<float>(std::sqrt(medium.squares(mean) / medium.length))}};
+    };
+    const Everywhere super = recordOf(average);
+    const Everywhere controlled = recordOf(control);
+    const auto asFloat = [](double value) {
+        return static_cast<double>(static_cast<float>(value));
+    };
+    const double residualBound = asFloat(std::max(max - control, control - min));
+    // A plan's rate is a quarter of the bound at least.
+    const auto rmsOf = [&](double taken, double bound) {
+        return std::max(asFloat(std::sqrt(medium.squares(taken) / medium.length)), bound / 4);
+    };
+    const double ratioRms = rmsOf(0, max);
+    const double residualRms = rmsOf(control, residualBound);
     trk::TrackingSettings settings;
     settings.exactFallback = false;
     settings.roulette = false;
@@ -66,21 +78,20 @@ void expectFormulas(const std::string& name, const Ramp& medium, double min, dou
             const bool rms = base == trk::RateBase::kRms;
             std::snprintf(label, sizeof(label), "%s, %g x %s, ratio", name.c_str(), multiplier,
                           rms ? "rms" : "majorant");
-            double rate = multiplier * static_cast<double>(rms ? super.range.rms : super.range.max);
+            double rate = multiplier * (rms ? ratioRms : max);
             const Measured ratio = measure(kSamples, [&](trk::Rng& rng, trk::PathCost& cost) {
-                return trk::trackTransmittance<trk::NoControl>(medium, super, ray, settings, rng,
-                                                               cost)[0];
+                return trk::trackTransmittance<trk::Control::kNone>(medium, super, ray, settings,
+                                                                    rng, cost)[0];
             });
             expectFormula(label, ratio, T, std::expm1(medium.squares(0) / rate),
                           rate * medium.length);
 
             std::snprintf(label, sizeof(label), "%s, %g x %s, residual", name.c_str(), multiplier,
                           rms ? "rms" : "majorant");
-            rate =
-                multiplier * static_cast<double>(rms ? super.item.residualRms : super.item.bound);
+            rate = multiplier * (rms ? residualRms : residualBound);
             const Measured residual = measure(kSamples, [&](trk::Rng& rng, trk::PathCost& cost) {
-                return trk::trackTransmittance<trk::ResidualControl>(medium, super, ray, settings,
-                                                                     rng, cost)[0];
+                return trk::trackTransmittance<trk::Control::kChosen>(medium, controlled, ray,
+                                                                      settings, rng, cost)[0];
             });
             expectFormula(label, residual, T, std::expm1(medium.squares(control) / rate),
                           rate * medium.length);
@@ -135,13 +146,13 @@ TEST(Formulas, RatioOverDeltaIsThePredictedOne) {
         const double formula = c.depth * T * std::expm1(c.depth / c.kappa) / ((1 - T) * (1 - T));
         EXPECT_NEAR(formula, c.predicted, 0.005);
         Everywhere super{};
-        super.range.max = static_cast<float>(c.kappa * medium.first);
+        super.item.max = static_cast<float>(c.kappa * medium.first);
         trk::TrackingSettings settings;
         settings.exactFallback = false;
         settings.roulette = false;
         const Measured ratio = measure(kSamples, [&](trk::Rng& rng, trk::PathCost& cost) {
-            return trk::trackTransmittance<trk::NoControl>(medium, super, medium.ray(), settings,
-                                                           rng, cost)[0];
+            return trk::trackTransmittance<trk::Control::kNone>(medium, super, medium.ray(),
+                                                                settings, rng, cost)[0];
         });
         const Measured delta = measure(kSamples, [&](trk::Rng& rng, trk::PathCost& cost) {
             return trk::trackBinary(medium, super, medium.ray(), settings, rng, cost)[0];
@@ -205,7 +216,7 @@ TEST(Analytic, HomogeneousSuperVoxelsTakeNoLookupAndHaveNoNoise) {
     const double T = std::exp(-4 * static_cast<double>(0.03f) * 24);
     using V = trk::Variant<1, 1, trk::ControlKind::kConstant>;
     const V::Extinction field(volume);
-    const V::Walk superVoxels{volume.superVoxels};
+    const V::Walk superVoxels(volume);
     trk::TrackingSettings settings;
     settings.lengthPerVoxel = clipped->lengthPerVoxel;
     double binary = 0;
@@ -214,9 +225,9 @@ TEST(Analytic, HomogeneousSuperVoxelsTakeNoLookupAndHaveNoNoise) {
         trk::Rng rng(1, 2, 3, i);
         trk::PathCost cost;
         const LocalRay& local = clipped->local;
-        const double ratio = trk::trackTransmittance<trk::NoControl>(field, superVoxels, local,
-                                                                     settings, rng, cost)[0];
-        const double residual = trk::trackTransmittance<trk::ResidualControl>(
+        const double ratio = trk::trackTransmittance<trk::Control::kNone>(field, superVoxels, local,
+                                                                          settings, rng, cost)[0];
+        const double residual = trk::trackTransmittance<trk::Control::kChosen>(
             field, superVoxels, local, settings, rng, cost)[0];
         const double marched = std::exp(
             -trk::marchOpticalDepth(field, local, settings.lengthPerVoxel, 2.7, rng, cost)[0]);

@@ -49,7 +49,7 @@ std::vector<Path> samplePaths(const Scene& scene, const PreparedRay& ray, bool d
     trk::withVariant(scene.volume, ControlKind::kConstant, [&](auto variant) {
         using V = decltype(variant);
         const typename V::Extinction field(scene.volume);
-        const typename V::Walk superVoxels{scene.volume.tracked()};
+        const typename V::Walk superVoxels(scene.volume);
         for (uint64_t i = 0; i < count; ++i) {
             trk::Rng rng(seed, 0, i, 0);
             const auto path = decompose ? trk::sampleFreePath<true>(field, superVoxels, ray.local,

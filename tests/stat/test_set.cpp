@@ -3,6 +3,8 @@
 
 #include "estimate/exact.h"
 #include "estimate/free_path.h"
+#include "estimate/plan.h"
+#include "estimate/ratio_tracking.h"
 #include "support/fixtures.h"
 #include "support/rays.h"
 #include "support/reference.h"
@@ -55,39 +57,35 @@ std::vector<PreparedRay> prepare(const trk::Volume& volume, size_t count) {
     return result;
 }
 
-template <class V, class Method>
+template <class V, trk::Control kControl>
 Moments momentsOf(const Scene& scene, const PreparedRay& ray, size_t channel) {
     const trk::TrackingSettings settings = scene.settings(ray);
     const typename V::Extinction field(scene.volume);
-    const typename V::Walk superVoxels{scene.volume.tracked()};
     const LocalRay& r = ray.local;
     const double unit = settings.lengthPerVoxel;
     const openvdb::Vec4d kPowers(1, 2, 3, 4);
     openvdb::Vec4d logMoments(0);  // of the powers 1 to 4
     Moments m;
     m.length = r.tEnd;
-    superVoxels.walk(r, 0, r.tEnd, [&](const auto& v, double t0, double t1) {
-        double rate = 0;
-        for (size_t c = 0; c < V::kChannels; ++c) {
-            rate = std::max(rate, Method::rate(v, c, settings.rateBase));
-        }
-        const bool hasResidual = Method::rate(v, channel, settings.rateBase) > 0;
-        rate *= settings.rate;
-        const auto extinction = [&](double t) { return field.extinction(r.at(t))[channel]; };
-        m.lookups += rate * unit * (t1 - t0);
-        if (!hasResidual) {
-            logMoments -= unit * Method::integrate(v, channel, r, t0, t1) * kPowers;
-            return true;
-        }
-        logMoments +=
-            unit * reference::integrateCells(r.origin, r.direction, t0, t1, [&](double t) {
-                const double control = Method::control(v, channel, r.at(t));
-                const double w = 1 - (extinction(t) - control) / rate;
-                const openvdb::Vec4d weights(w - 1, w * w - 1, w * w * w - 1, w * w * w * w - 1);
-                return rate * weights - control * kPowers;
-            });
-        return true;
-    });
+    trk::forEachStretch<kControl>(
+        typename V::Walk(scene.volume), r, settings, [&](const auto& plan, size_t i) {
+            const double rate = plan.rate(i) / unit;
+            m.lookups += plan.collisions(i);
+            if (!plan.isTracked(i, channel)) {
+                logMoments -= plan.depth(i, channel) * kPowers;
+                return;
+            }
+            logMoments +=
+                unit * reference::integrateCells(
+                           r.origin, r.direction, plan.tEnter(i), plan.tExit(i), [&](double t) {
+                               const double control = plan.control(i, channel, r.at(t));
+                               const double extinction = field.extinction(r.at(t))[channel];
+                               const double w = 1 - (extinction - control) / rate;
+                               const openvdb::Vec4d weights(w - 1, w * w - 1, w * w * w - 1,
+                                                            w * w * w * w - 1);
+                               return rate * weights - control * kPowers;
+                           });
+        });
     const double T = std::exp(logMoments[0]);
     const double m2 = std::exp(logMoments[1]);
     const double m3 = std::exp(logMoments[2]);
@@ -186,9 +184,9 @@ std::array<double, 3> Scene::estimate(const PreparedRay& ray, const trk::Trackin
         const auto estimate = way.method == TRK_METHOD_DELTA
                                   ? trk::trackBinary(field, superVoxels, ray.local, s, rng, cost)
                               : way.method == TRK_METHOD_RATIO
-                                  ? trk::trackTransmittance<trk::NoControl>(field, superVoxels,
-                                                                            ray.local, s, rng, cost)
-                                  : trk::trackTransmittance<trk::ResidualControl>(
+                                  ? trk::trackTransmittance<trk::Control::kNone>(
+                                        field, superVoxels, ray.local, s, rng, cost)
+                                  : trk::trackTransmittance<trk::Control::kChosen>(
                                         field, superVoxels, ray.local, s, rng, cost);
         std::copy(estimate.begin(), estimate.end(), result.begin());
     });
@@ -203,8 +201,8 @@ Moments momentsOf(const Scene& scene, const PreparedRay& ray, size_t channel) {
     scene.withFields([&](auto variant, const auto&, const auto&) {
         using V = decltype(variant);
         m = scene.way.method == TRK_METHOD_RESIDUAL
-                ? momentsOf<V, trk::ResidualControl>(scene, ray, channel)
-                : momentsOf<V, trk::NoControl>(scene, ray, channel);
+                ? momentsOf<V, trk::Control::kChosen>(scene, ray, channel)
+                : momentsOf<V, trk::Control::kNone>(scene, ray, channel);
     });
     return m;
 }

@@ -123,7 +123,7 @@ struct Scene {
                          [&](auto variant) {
                              using V = decltype(variant);
                              body(variant, typename V::Extinction(volume),
-                                  typename V::Walk{volume.tracked()});
+                                  typename V::Walk(volume));
                          });
     }
 

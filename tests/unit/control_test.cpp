@@ -2,6 +2,8 @@
 // Controls that vary within a super-voxel: their fits, their closed forms, their bounds.
 #include "bake/bake.h"
 #include "bake/control_fit.h"
+#include "control/control_choice.h"
+#include "estimate/plan.h"
 #include "query/variant.h"
 #include "support/fixtures.h"
 #include "support/rays.h"
@@ -299,31 +301,37 @@ TEST(Control, ClosedFormsAreTheIntegralsOfWhatCollisionsSee) {
     const std::string vdb = fixtures::cloudFile(64, "color-cloud");
     for (const ControlKind kind : kVarying) {
         const trk::Volume volume = openWith(vdb, kind, 8, TRK_CHOICE_ROBUST, 40, {{1, 2, 0.5f}});
-        trk::withVariant(volume, volume.superVoxels.kind(), [&](auto variant) {
+        trk::withVariant(volume, volume.superVoxels->kind(), [&](auto variant) {
             using V = decltype(variant);
             double largest = 0;
-            size_t reduced = 0;  // super-voxels whose chosen control is less than the baked one
+            double kept = 0;  // optical depth of the chosen control, less than the baked one's
+            double baked = 0;
             for (const trk::LocalRay& ray : localRays(volume, 60)) {
-                typename V::Walk{volume.superVoxels}.walk(
-                    ray, 0, ray.tEnd, [&](const auto& v, double t0, double t1) {
+                trk::forEachStretch<trk::Control::kChosen>(
+                    typename V::Walk(volume), ray, {}, [&](const auto& plan, size_t i) {
+                        const double t0 = plan.tEnter(i);
+                        const double t1 = plan.tExit(i);
                         for (size_t c = 0; c < V::kChannels; ++c) {
                             double sum = 0;  // Simpson's rule: exact for cubics
                             for (const auto& [t, weight] :
                                  {std::pair{t0, 1.0 / 6}, std::pair{0.5 * (t0 + t1), 4.0 / 6},
                                   std::pair{t1, 1.0 / 6}}) {
-                                sum += weight * (t1 - t0) * v.control(c, ray.at(t));
+                                sum += weight * (t1 - t0) * plan.control(i, c, ray.at(t));
                             }
-                            EXPECT_NEAR(
-                                v.integrateControl(c, ray, t0, t1), sum,
-                                1e-9 * static_cast<double>(v.range(c).max) * (t1 - t0) + 1e-12);
+                            EXPECT_NEAR(plan.depth(i, c), sum,
+                                        1e-9 * plan.max(i, c) * (t1 - t0) + 1e-12);
                             largest = std::max(largest, sum);
-                            reduced += v[c].control < v[c].baked ? 1 : 0;
+                            kept += plan.depth(i, c);
                         }
-                        return true;
                     });
+                uint64_t ignored = 0;
+                for (const double whole : V::integrateControl(volume, ray, 0, ignored)) {
+                    baked += whole;
+                }
             }
             EXPECT_GT(largest, 0);
-            EXPECT_GT(reduced, 0u);
+            EXPECT_LT(kept, baked);
+            EXPECT_GT(kept, 0);
         });
     }
 }
@@ -338,22 +346,21 @@ TEST(Control, BoundsHoldForEveryChoiceKindAndChannel) {
         for (const ControlKind kind : kVarying) {
             for (const TrkChoice choice : {TRK_CHOICE_ROBUST, TRK_CHOICE_MEAN}) {
                 const trk::Volume volume = openWith(file, kind, 8, choice, 20, {{1, 3, 0.25f}});
-                trk::withVariant(volume, volume.superVoxels.kind(), [&](auto variant) {
+                trk::withVariant(volume, volume.superVoxels->kind(), [&](auto variant) {
                     using V = decltype(variant);
                     const typename V::Extinction field(volume);
                     for (const trk::LocalRay& ray : localRays(volume, 80)) {
-                        typename V::Walk{volume.superVoxels}.walk(
-                            ray, 0, ray.tEnd, [&](const auto& v, double t0, double t1) {
+                        trk::forEachStretch<trk::Control::kChosen>(
+                            typename V::Walk(volume), ray, {}, [&](const auto& plan, size_t i) {
                                 for (const double f : {0.01, 0.3, 0.5, 0.77, 0.99}) {
-                                    const Vec3d p = ray.at(t0 + f * (t1 - t0));
+                                    const Vec3d p = ray.at(plan.tEnter(i) + f * plan.length(i));
                                     const auto extinction = field.extinction(p);
                                     for (size_t c = 0; c < V::kChannels; ++c) {
-                                        const double residual = extinction[c] - v.control(c, p);
-                                        EXPECT_LE(std::fabs(residual),
-                                                  static_cast<double>(v[c].bound));
+                                        const double residual =
+                                            extinction[c] - plan.control(i, c, p);
+                                        EXPECT_LE(std::fabs(residual), plan.bound(i, c));
                                     }
                                 }
-                                return true;
                             });
                     }
                 });
@@ -390,12 +397,15 @@ TEST(Control, BoundsOfConstantControlsCoverWhatLookUpsReturn) {
             }
             const trk::LocalRay ray{p, {{1, 0, 0}}, {{1, 1e300, 1e300}}, 1e-9};
             const double mu = field.extinction(p)[0];
-            V::Walk{volume.superVoxels}.walk(ray, 0, 1e-9, [&](const auto& v, double, double) {
-                EXPECT_GE(mu, static_cast<double>(v.range(0).min));
-                EXPECT_LE(mu, static_cast<double>(v.range(0).max));
-                EXPECT_LE(std::fabs(mu - v.control(0, p)), static_cast<double>(v[0].bound));
-                return false;
-            });
+            size_t met = 0;
+            trk::forEachStretch<trk::Control::kChosen>(
+                V::Walk(volume), ray, {}, [&](const auto& plan, size_t k) {
+                    if (met++ == 0) {
+                        EXPECT_GE(mu, plan.min(k, 0));
+                        EXPECT_LE(mu, plan.max(k, 0));
+                        EXPECT_LE(std::fabs(mu - plan.control(k, 0, p)), plan.bound(k, 0));
+                    }
+                });
             const auto found = baked.table.find(
                 static_cast<int64_t>(p[0]), static_cast<int64_t>(p[1]), static_cast<int64_t>(p[2]));
             const auto& item = baked.items[trk::SparseTable::index(found.entry)];
@@ -407,24 +417,26 @@ TEST(Control, BoundsOfConstantControlsCoverWhatLookUpsReturn) {
 }
 
 TEST(Control, RobustKeepsWhatIsThinAndTakesTheMinimumOfWhatIsThick) {
-    using trk::SuperVoxels;
+    const auto share = [](TrkChoice choice, double min, double max, double excess,
+                          double diagonal) {
+        return trk::ControlChoice{choice, diagonal}.share(min, max, excess);
+    };
     // At most ln 2 collisions in which the control exceeds the extinction by all of the range.
-    EXPECT_EQ(SuperVoxels::chooseShare(TRK_CHOICE_ROBUST, 0, 1, 0.8, 0.5), 1);
-    EXPECT_LT(SuperVoxels::chooseShare(TRK_CHOICE_ROBUST, 0, 1, 0.8, 100), 0.01);
-    EXPECT_EQ(SuperVoxels::chooseShare(TRK_CHOICE_MEAN, 0, 1, 0.8, 100), 1);
-    EXPECT_EQ(SuperVoxels::chooseShare(TRK_CHOICE_ROBUST, 1, 1, 0, 100), 1);
+    EXPECT_EQ(share(TRK_CHOICE_ROBUST, 0, 1, 0.8, 0.5), 1);
+    EXPECT_LT(share(TRK_CHOICE_ROBUST, 0, 1, 0.8, 100), 0.01);
+    EXPECT_EQ(share(TRK_CHOICE_MEAN, 0, 1, 0.8, 100), 1);
+    EXPECT_EQ(share(TRK_CHOICE_ROBUST, 1, 1, 0, 100), 1);
     for (const double diagonal : {1e-12, 1.0, 1e12}) {
-        const double share = SuperVoxels::chooseShare(TRK_CHOICE_ROBUST, 0, 1e30, 1e20, diagonal);
-        EXPECT_GE(share, 0);
-        EXPECT_LE(share, 1);
+        const double kept = share(TRK_CHOICE_ROBUST, 0, 1e30, 1e20, diagonal);
+        EXPECT_GE(kept, 0);
+        EXPECT_LE(kept, 1);
     }
     // Where nothing is hit, the weight is exp(excess x length): never more than e, however far a
     // fit exceeds the density.
     for (const double diagonal : {1e-3, 0.1, 1.0, 10.0, 1e3}) {
         for (const double excess : {0.1, 1.0, 50.0, 1e6}) {
-            const double share =
-                SuperVoxels::chooseShare(TRK_CHOICE_ROBUST, 0, 1, excess, diagonal);
-            EXPECT_LE(diagonal * share * excess, 1 + 1e-12);
+            const double kept = share(TRK_CHOICE_ROBUST, 0, 1, excess, diagonal);
+            EXPECT_LE(diagonal * kept * excess, 1 + 1e-12);
         }
     }
 }
@@ -469,19 +481,18 @@ TEST(Bake, EqualSuperVoxelsThatVaryAreNotMergedIntoTiles) {
     const std::string vdb = fixtures::write("pattern.vdb", {grid});
     for (const ControlKind kind : kVarying) {
         const trk::Volume volume = openWith(vdb, kind, 4, TRK_CHOICE_MEAN, 1);
-        trk::withVariant(volume, volume.superVoxels.kind(), [&](auto variant) {
+        trk::withVariant(volume, volume.superVoxels->kind(), [&](auto variant) {
             using V = decltype(variant);
             const typename V::Extinction field(volume);
             size_t met = 0;
             for (const trk::LocalRay& ray : localRays(volume, 50)) {
-                typename V::Walk{volume.superVoxels}.walk(
-                    ray, 0, ray.tEnd, [&](const auto& v, double t0, double t1) {
-                        const Vec3d p = ray.at(0.5 * (t0 + t1));
-                        const double residual = field.extinction(p)[0] - v.control(0, p);
-                        EXPECT_LE(t1 - t0, 4 * std::sqrt(3) + 1e-9);
-                        EXPECT_LE(std::fabs(residual), static_cast<double>(v[0].bound) + 1e-5);
+                trk::forEachStretch<trk::Control::kChosen>(
+                    typename V::Walk(volume), ray, {}, [&](const auto& plan, size_t i) {
+                        const Vec3d p = ray.at(0.5 * (plan.tEnter(i) + plan.tExit(i)));
+                        const double residual = field.extinction(p)[0] - plan.control(i, 0, p);
+                        EXPECT_LE(plan.length(i), 4 * std::sqrt(3) + 1e-9);
+                        EXPECT_LE(std::fabs(residual), plan.bound(i, 0) + 1e-5);
                         ++met;
-                        return true;
                     });
             }
             EXPECT_GT(met, 100u);

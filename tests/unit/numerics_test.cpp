@@ -1,15 +1,19 @@
 // SPDX-License-Identifier: Apache-2.0
 // The small pieces of arithmetic: scaled products, halfs, random numbers, the robust control, maps.
+#include "control/control_choice.h"
 #include "control/super_voxels.h"
+#include "estimate/plan.h"
 #include "estimate/rng.h"
 #include "estimate/scaled_product.h"
 #include "field/density_field.h"
+#include "query/variant.h"
 #include "space/geometry.h"
 
 #include <gtest/gtest.h>
 
 #include <cmath>
 #include <limits>
+#include <memory>
 
 namespace {
 
@@ -130,7 +134,9 @@ TEST(Rng, EveryPartOfItsNameMatters) {
 }
 
 double robust(double min, double mean, double max, double diagonal) {
-    return trk::SuperVoxels::chooseControl(TRK_CHOICE_ROBUST, min, mean, max, diagonal);
+    double control = 0;
+    trk::ControlChoice{TRK_CHOICE_ROBUST, diagonal}.takeConstant(min, mean, max, control);
+    return control;
 }
 
 TEST(RobustControl, MatchesTheKnownFactors) {
@@ -164,22 +170,26 @@ TEST(SuperVoxels, BoundsCoverTheResidualOfEveryChoice) {
             [](const trk::Int3&) { return 1u; });
         baked.items.push_back({0.1f, 0.7f, 0.3f, 0.2f, 0.4f, 0.2f});
         const float scale = 3.3f;
-        const trk::SuperVoxels opened(std::move(baked), {static_cast<double>(scale)}, choice, 0.05);
+        trk::Volume opened;
+        opened.scales = {static_cast<double>(scale)};
+        opened.superVoxels = std::make_shared<const trk::SuperVoxels>(std::move(baked));
+        opened.controlChoice = {choice, 0.05};
         trk::LocalRay ray;
         ray.direction[0] = 1;
         ray.inverse = {{1, 1e300, 1e300}};
         ray.tEnd = 16;
         int met = 0;
-        const auto visit = [&](const auto& v, double, double) {
-            ++met;
-            for (const float density : {0.1f, 0.3f, 0.7f}) {
-                const double residual = static_cast<double>(scale) * static_cast<double>(density) -
-                                        static_cast<double>(v[0].control);
-                EXPECT_LE(std::fabs(residual), static_cast<double>(v[0].bound));
-            }
-            return true;
-        };
-        opened.walk<1, trk::ControlKind::kConstant>(ray, 0, 16, visit);
+        trk::forEachStretch<trk::Control::kChosen>(
+            trk::Variant<1, 1, trk::ControlKind::kConstant>::Walk(opened), ray, {},
+            [&](const auto& plan, size_t i) {
+                ++met;
+                for (const float density : {0.1f, 0.3f, 0.7f}) {
+                    const double residual =
+                        static_cast<double>(scale) * static_cast<double>(density) -
+                        plan.control(i, 0, {});
+                    EXPECT_LE(std::fabs(residual), plan.bound(i, 0));
+                }
+            });
         EXPECT_EQ(met, 1);
     }
 }

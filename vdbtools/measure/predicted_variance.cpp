@@ -1,7 +1,7 @@
 // SPDX-License-Identifier: Apache-2.0
 #include "predicted_variance.h"
 
-#include "estimate/ratio_tracking.h"
+#include "estimate/plan.h"
 #include "query/batch.h"
 #include "query/methods.h"
 #include "query/variant.h"
@@ -44,81 +44,61 @@ double integrateGauss(double t0, double t1, const G& g) {
     return half * sum;
 }
 
-template <size_t C, class Method, class View>
-double rateOf(const View& v, const trk::TrackingSettings& settings) {
-    double rate = 0;
-    for (size_t c = 0; c < C; ++c) {
-        rate = std::max(rate, settings.rate * Method::rate(v, c, settings.rateBase));
-    }
-    return rate;
-}
-double expectedLookups(double rate, const trk::TrackingSettings& settings, double voxels) {
-    return rate * settings.lengthPerVoxel * voxels;
-}
-/// Beyond which a super-voxel is integrated exactly.
-double mostLookups(const trk::TrackingSettings& settings, const trk::LocalRay& ray, double voxels) {
-    return settings.exactFallback ? trk::ExactCost(ray)(voxels) : trk::kMostLookups;
-}
-
-template <class V, class Method>
+template <class V, trk::Control kControl>
 PredictedCost costOf(const Volume& volume, const TrkQuery& query, const trk::ClippedRay& clipped) {
     const trk::TrackingSettings settings = trk::trackingSettings(query, clipped.lengthPerVoxel);
-    const trk::LocalRay& ray = clipped.local;
+    const trk::ExactCost exactCost(clipped.local);
     PredictedCost cost;
-    typename V::Walk{volume.tracked()}.walk(
-        ray, 0, ray.tEnd, [&](const auto& v, double t0, double t1) {
-            const double lookups =
-                expectedLookups(rateOf<V::kChannels, Method>(v, settings), settings, t1 - t0);
-            const bool tracked = lookups <= mostLookups(settings, ray, t1 - t0);
-            cost.estimate += tracked ? lookups : trk::ExactCost(ray)(t1 - t0);
-            cost.exact += trk::ExactCost(ray)(t1 - t0);
-            return true;
-        });
+    trk::forEachStretch<kControl>(typename V::Walk(volume), clipped.local, settings,
+                                  [&](const auto& plan, size_t i) {
+                                      const double exact = exactCost(plan.length(i));
+                                      cost.estimate += plan.isExact(i) ? exact : plan.collisions(i);
+                                      cost.exact += exact;
+                                  });
     return cost;
 }
 
 /// Per channel, the integral of residual^2 / rate over what is tracked.
-template <class V, class Method>
+template <class V, trk::Control kControl>
 std::array<double, V::kChannels> integrateNoise(const Volume& volume, const TrkQuery& query,
                                                 const trk::ClippedRay& clipped) {
     constexpr size_t C = V::kChannels;
     const trk::TrackingSettings settings = trk::trackingSettings(query, clipped.lengthPerVoxel);
     const typename V::Extinction field(volume);
-    const typename V::Walk superVoxels{volume.tracked()};
     const trk::LocalRay& ray = clipped.local;
+    const double unit = settings.lengthPerVoxel;
     std::array<double, C> sum{};
-    superVoxels.walk(ray, 0, ray.tEnd, [&](const auto& v, double t0, double t1) {
-        const double rate = rateOf<C, Method>(v, settings);
-        if (rate == 0 ||
-            expectedLookups(rate, settings, t1 - t0) > mostLookups(settings, ray, t1 - t0)) {
-            return true;
-        }
-        const auto add = [&](double a, double b, bool empty) {
-            for (size_t c = 0; c < C; ++c) {
-                if (C == 1 || Method::rate(v, c, settings.rateBase) > 0) {
-                    sum[c] += settings.lengthPerVoxel / rate * integrateGauss(a, b, [&](double t) {
-                                  const trk::Vec3d p = ray.at(t);
-                                  const double mu = empty ? 0 : field.extinction(p)[c];
-                                  const double residual = mu - Method::control(v, c, p);
-                                  return residual * residual;
-                              });
+    trk::forEachStretch<kControl>(
+        typename V::Walk(volume), ray, settings, [&](const auto& plan, size_t i) {
+            if (plan.rate(i) == 0 || plan.isExact(i)) {
+                return;
+            }
+            const auto add = [&](double a, double b, bool empty) {
+                for (size_t c = 0; c < C; ++c) {
+                    if (plan.isTracked(i, c)) {
+                        sum[c] += unit * unit / plan.rate(i) * integrateGauss(a, b, [&](double t) {
+                                      const trk::Vec3d p = ray.at(t);
+                                      const double mu = empty ? 0 : field.extinction(p)[c];
+                                      const double residual = mu - plan.control(i, c, p);
+                                      return residual * residual;
+                                  });
+                    }
                 }
+            };
+            double done = plan.tEnter(i);
+            field.forEachCell(ray, done, plan.tExit(i),
+                              [&](double tEnter, double tExit, const auto&) {
+                                  if (tEnter > done) {
+                                      add(done, tEnter, true);  // nothing, but perhaps a control
+                                  }
+                                  add(tEnter, tExit, false);
+                                  done = tExit;
+                                  return true;
+                              });
+            if (plan.tExit(i) > done) {
+                add(done, plan.tExit(i), true);
             }
-        };
-        double done = t0;
-        field.forEachCell(ray, t0, t1, [&](double tEnter, double tExit, const auto&) {
-            if (tEnter > done) {
-                add(done, tEnter, true);  // nothing there, but perhaps a control
-            }
-            add(tEnter, tExit, false);
-            done = tExit;
-            return true;
         });
-        if (t1 > done) {
-            add(done, t1, true);
-        }
-        return true;
-    });
     return sum;
 }
 
@@ -143,8 +123,8 @@ std::array<double, 3> predictVariance(const Volume& volume, const TrkQuery& quer
         volume, residual ? volume.tracked().kind() : ControlKind::kConstant, [&](auto variant) {
             using V = decltype(variant);
             const auto noise =
-                residual ? integrateNoise<V, trk::ResidualControl>(volume, query, *clipped)
-                         : integrateNoise<V, trk::NoControl>(volume, query, *clipped);
+                residual ? integrateNoise<V, trk::Control::kChosen>(volume, query, *clipped)
+                         : integrateNoise<V, trk::Control::kNone>(volume, query, *clipped);
             for (size_t c = 0; c < V::kChannels; ++c) {
                 result[c] = varianceOf(depth[c], noise[c]);
             }
@@ -159,8 +139,8 @@ PredictedCost predictCost(const Volume& volume, const TrkQuery& query, const Trk
         trk::withVariant(
             volume, residual ? volume.tracked().kind() : ControlKind::kConstant, [&](auto variant) {
                 using V = decltype(variant);
-                cost = residual ? costOf<V, trk::ResidualControl>(volume, query, *clipped)
-                                : costOf<V, trk::NoControl>(volume, query, *clipped);
+                cost = residual ? costOf<V, trk::Control::kChosen>(volume, query, *clipped)
+                                : costOf<V, trk::Control::kNone>(volume, query, *clipped);
             });
     }
     return cost;

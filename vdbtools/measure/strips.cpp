@@ -1,7 +1,9 @@
 // SPDX-License-Identifier: Apache-2.0
 #include "strips.h"
 
+#include "estimate/plan.h"
 #include "query/transmittance.h"
+#include "query/variant.h"
 #include "view/camera.h"
 
 #include <array>
@@ -11,26 +13,28 @@
 namespace vdbtools {
 namespace {
 
-/// Transmittance of the chosen control along a ray of a grey or tinted volume, mean over channels.
-template <size_t C>
+/// Transmittance of the chosen control along a ray, mean over channels.
 double controlTransmittance(const trk::Volume& volume, const TrkRay& ray) {
     const auto clipped = volume.clip(ray, volume.field->box());
     if (!clipped) {
         return 1;
     }
-    std::array<double, C> depth{};
-    const trk::LocalRay& local = clipped->local;
-    volume.tracked().walk<C, trk::ControlKind::kConstant>(
-        local, 0, local.tEnd, [&](const auto& v, double t0, double t1) {
-            for (size_t c = 0; c < C; ++c) {
-                depth[c] += v.integrateControl(c, local, t0, t1);
-            }
-            return true;
-        });
     double sum = 0;
-    for (const double d : depth) {
-        sum += std::exp(-d * clipped->lengthPerVoxel) / static_cast<double>(C);
-    }
+    trk::withVariant(volume, volume.tracked().kind(), [&](auto variant) {
+        using V = decltype(variant);
+        std::array<double, V::kChannels> depth{};
+        trk::TrackingSettings settings;
+        settings.lengthPerVoxel = clipped->lengthPerVoxel;
+        trk::forEachStretch<trk::Control::kChosen>(typename V::Walk(volume), clipped->local,
+                                                   settings, [&](const auto& plan, size_t i) {
+                                                       for (size_t c = 0; c < V::kChannels; ++c) {
+                                                           depth[c] += plan.depth(i, c);
+                                                       }
+                                                   });
+        for (const double d : depth) {
+            sum += std::exp(-d) / static_cast<double>(V::kChannels);
+        }
+    });
     return sum;
 }
 
@@ -76,8 +80,7 @@ Strip drawStrip(const Source& source, const trk::BakedVolume& baked, bool whole,
         StripRow row;
         row.choice = choice;
         for (size_t i = 0; i < pixels; ++i) {
-            const double control = channels == 1 ? controlTransmittance<1>(volume, rays[i])
-                                                 : controlTransmittance<3>(volume, rays[i]);
+            const double control = controlTransmittance(volume, rays[i]);
             double mean = 0;
             double variance = 0;
             for (size_t c = 0; c < channels; ++c) {

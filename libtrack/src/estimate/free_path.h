@@ -3,6 +3,7 @@
 // the binary transmittance that delta tracking makes of it.
 #pragma once
 
+#include "plan.h"
 #include "tracking.h"
 
 #include <algorithm>
@@ -10,7 +11,7 @@
 #include <cmath>
 #include <cstddef>
 #include <limits>
-#include <type_traits>
+#include <utility>
 
 namespace trk {
 
@@ -50,23 +51,24 @@ struct OneChannelField {
         });
     }
 };
-template <class View>
-struct OneChannelView {
-    const View& view;
-    size_t channel;
-
-    const auto& range(size_t) const { return view.range(channel); }
-};
 template <class SuperVoxels>
 struct OneChannelWalk {
+    static constexpr size_t kChannels = 1;
+    static constexpr ControlKind kKind = ControlKind::kConstant;  // nobody looks at it
     const SuperVoxels& superVoxels;
     size_t channel;
 
-    template <class Visit>
-    void walk(const LocalRay& ray, double t0, double t1, Visit&& visit) const {
-        superVoxels.walk(ray, t0, t1, [&](const auto& v, double tEnter, double tExit) {
-            return visit(OneChannelView<std::decay_t<decltype(v)>>{v, channel}, tEnter, tExit);
-        });
+    double scale(size_t) const { return superVoxels.scale(channel); }
+    const ControlChoice& choice() const { return superVoxels.choice(); }
+    using Whole = decltype(std::declval<const SuperVoxels&>().cursor(
+        std::declval<const LocalRay&>(), 0.0, 0.0));
+    struct Cursor : Whole {
+        Cursor(const Whole& whole, size_t only) : Whole(whole), channel(only) {}
+        const SuperVoxel& record(size_t i, size_t) const { return Whole::record(i, channel); }
+        size_t channel;
+    };
+    Cursor cursor(const LocalRay& ray, double t0, double t1) const {
+        return {superVoxels.cursor(ray, t0, t1), channel};
     }
 };
 
@@ -183,29 +185,28 @@ FreePath<Field::kChannels> sampleFreePath(const Field& field, const SuperVoxels&
                                           const LocalRay& ray, const TrackingSettings& settings,
                                           Random& random, PathCost& cost) {
     constexpr size_t C = Field::kChannels;
+    constexpr Control kControl = kDecompose ? Control::kMinimum : Control::kNone;
+    TrackingSettings bounded = settings;  // collisions are a share of a bound, whatever was asked
+    bounded.rateBase = RateBase::kMajorant;
+    Plan<kControl, SuperVoxels> plan(superVoxels, ray, bounded);
+    const MostLookups mostLookups(ray, settings);
     FreePath<C> path;
-    double distance = random.exponential();  // in units of the rate; see trackTransmittance
-    superVoxels.walk(ray, 0, ray.tEnd, [&](const auto& v, double tEnter, double tExit) {
-        ++cost.superVoxels;
-        std::array<double, C> control;
-        double controlRate = 0;
-        double residualRate = 0;
-        for (size_t c = 0; c < C; ++c) {
-            const auto& range = v.range(c);
-            control[c] = kDecompose || range.isHomogeneous() ? static_cast<double>(range.min) : 0.0;
-            controlRate = std::max(controlRate, control[c]);
-            residualRate = std::max(residualRate, static_cast<double>(range.max) - control[c]);
-        }
-        residualRate *= settings.rate;
+    double distance = random.exponential();  // in units of the rate; see RatioWalk
+    // Tracks a stretch, where `remaining` is what the rate makes of its length; whether the path
+    // goes on.
+    const auto track = [&](size_t i, double controlRate, double remaining) {
+        const double tExit = plan.tExit(i);
+        const double residualRate = plan.rate(i) / settings.lengthPerVoxel;
         const double rate = controlRate + residualRate;
         const double ratePerVoxel = rate * settings.lengthPerVoxel;
-        const double voxels = tExit - tEnter;
+        std::array<double, C> control;
+        for (size_t c = 0; c < C; ++c) {
+            control[c] = plan.control(i, c, ray.origin);  // the same everywhere
+        }
         // Where a ray meets little of what the rate covers, null collisions would never end. After
         // as many as integrating exactly takes, that is what is done with the rest: having come so
         // far, how to go on is free.
-        double budget = settings.exactFallback ? ExactCost(ray)(voxels) : kMostLookups;
-        double remaining = ratePerVoxel * voxels;
-        cost.random = cost.random || remaining > 0;
+        double budget = mostLookups(plan.length(i));
         while (distance < remaining) {
             remaining -= distance;
             distance = random.exponential();
@@ -254,7 +255,24 @@ FreePath<Field::kChannels> sampleFreePath(const Field& field, const SuperVoxels&
         }
         distance -= remaining;
         return true;
-    });
+    };
+    while (plan.next() > 0) {
+        for (size_t i = 0; i < plan.count(); ++i) {
+            ++cost.superVoxels;
+            double controlRate = 0;
+            for (size_t c = 0; c < C; ++c) {
+                controlRate = std::max(controlRate, plan.control(i, c, ray.origin));
+            }
+            const double remaining =
+                plan.collisions(i) + controlRate * settings.lengthPerVoxel * plan.length(i);
+            cost.random = cost.random || remaining > 0;
+            if (distance >= remaining) {
+                distance -= remaining;
+            } else if (!track(i, controlRate, remaining)) {
+                return path;
+            }
+        }
+    }
     return path;
 }
 

@@ -2,6 +2,7 @@
 // What the random walks share: how they are set, what they spent, when they had better integrate.
 #pragma once
 
+#include "space/lanes.h"
 #include "space/local_ray.h"
 
 #include <cmath>
@@ -47,5 +48,24 @@ class ExactCost {
 /// More than this many look-ups in a super-voxel are never taken, whatever is asked for: the
 /// steps of a walk would drown in the rounding of what remains, and it would never end.
 inline constexpr double kMostLookups = 1e9;
+
+/// How many look-ups are taken on voxel lengths of a ray before integrating them exactly is
+/// preferred.
+class MostLookups {
+  public:
+    MostLookups(const LocalRay& ray, const TrackingSettings& settings) {
+        if (settings.exactFallback) {
+            base_ = ExactCost(ray)(0);
+            perVoxel_ = ExactCost(ray)(1) - base_;
+        }
+    }
+    double operator()(double voxels) const { return base_ + perVoxel_ * voxels; }
+    /// Of four lengths at once.
+    void of(const Double4& voxels, Double4& most) const { most = base_ + perVoxel_ * voxels; }
+
+  private:
+    double base_ = kMostLookups;
+    double perVoxel_ = 0;
+};
 
 }  // namespace trk

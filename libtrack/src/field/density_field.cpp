@@ -32,31 +32,26 @@ std::array<double, C> integrateLine(const DensityField& field, const Stored* bri
     LineIntegral<C, Stored> line(field.table(), bricks, ray);
     std::array<double, C> sum{};
     TableCursor cursor(field.table(), ray, t0, t1);
-    Crossing crossing{};
     uint64_t met = 0;
     while (const size_t count = cursor.refill()) {
         met += count;
         for (size_t i = 0; i < count;) {
-            cursor.take<true>(i, crossing);
-            if (DensityField::isConstant(crossing.entry)) {
-                const float* constant = field.constant(crossing.entry);
+            const double tEnter = cursor.tEnter(i);
+            if (DensityField::isConstant(cursor.entry(i))) {
+                const float* constant = field.constant(cursor.entry(i));
                 for (size_t c = 0; c < C; ++c) {
-                    sum[c] += static_cast<double>(constant[c]) * (crossing.tExit - crossing.tEnter);
+                    sum[c] += static_cast<double>(constant[c]) * (cursor.tExit(i) - tEnter);
                 }
                 ++i;
                 continue;
             }
             // Bricks one after another are one stretch.
-            Crossing last = crossing;
-            for (++i; i < count && !DensityField::isConstant(cursor.entry(i)); ++i) {
-                Crossing next;
-                cursor.take<false>(i, next);
-                if (next.tEnter != last.tExit) {
-                    break;
-                }
-                last = next;
-            }
-            line.add(crossing.lo, crossing.tEnter, last.tExit);
+            const Vec3d lo = cursor.lo(i);
+            do {
+                ++i;
+            } while (i < count && !DensityField::isConstant(cursor.entry(i)) &&
+                     cursor.tEnter(i) == cursor.tExit(i - 1));
+            line.add(lo, tEnter, cursor.tExit(i - 1));
         }
     }
     const std::array<double, C> cells = line.sum();

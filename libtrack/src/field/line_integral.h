@@ -103,13 +103,6 @@ class LineIntegral {
         met_ += window.count;
     }
 
-    // Vectors go by reference: how they would be returned depends on the processor.
-    static void load(const double* from, Double4& to) { std::memcpy(&to, from, sizeof(to)); }
-    static void load(const int32_t* from, Double4& to) {
-        Int4 integers;
-        std::memcpy(&integers, from, sizeof(integers));
-        to = __builtin_convertvector(integers, Double4);
-    }
     static void join(const Double4& a, const Double4& b, Float8& to) {
         const Float4 x = __builtin_convertvector(a, Float4);
         const Float4 y = __builtin_convertvector(b, Float4);

@@ -31,6 +31,8 @@ class TableCursor {
   public:
     using Entry = SparseTable::Entry;
 
+    static constexpr size_t kMost = 16;  ///< items found at once
+
     TableCursor(const SparseTable& table, const LocalRay& ray, double t0, double t1)
         : table_(table), ray_(ray) {
         if (table.empty()) {
@@ -46,18 +48,18 @@ class TableCursor {
         levels_[0].begin(root, ray, cell, t0, t1);
     }
 
-    /// The next occupied region; false at the end. `kWithPlace`: with its lower corner.
-    template <bool kWithPlace = true>
+    /// The next occupied region; false at the end.
     bool next(Crossing& crossing) {
         if (at_ == count_ && refill() == 0) {
             return false;
         }
-        take<kWithPlace>(at_++, crossing);
+        const size_t i = at_++;
+        crossing = {entry(i), table_.shiftAt(depth_), tEnter(i), tExit(i), lo(i)};
         return true;
     }
 
-    /// The next occupied regions, a few at once: how many; 0 at the end. Then take(0) to
-    /// take(count - 1) are they, until the next call. Not to be mixed with next().
+    /// The next occupied regions, a few at once: how many; 0 at the end. They are those from 0 on,
+    /// until the next call. Not to be mixed with next().
     size_t refill() {
         at_ = count_ = 0;
         while (count_ == 0 && depth_ >= 0) {
@@ -73,26 +75,22 @@ class TableCursor {
         return count_;
     }
     Entry entry(size_t i) const { return entries_[i]; }
-    template <bool kWithPlace>
-    void take(size_t i, Crossing& crossing) const {
-        const size_t cell = cells_[i];
-        crossing.entry = entries_[i];
-        crossing.tEnter = window_.time[cell];
-        crossing.tExit = window_.time[cell + 1];
-        if constexpr (kWithPlace) {
-            const Lattice lattice = table_.lattice(depth_);
-            crossing.shift = table_.shiftAt(depth_);
-            for (size_t a = 0; a < 3; ++a) {
-                crossing.lo[static_cast<int>(a)] =
-                    lattice.size * static_cast<double>(lattice.first[a] + window_.cell(a, cell));
-            }
+    double tEnter(size_t i) const { return window_.time[cells_[i]]; }
+    double tExit(size_t i) const { return window_.time[cells_[i] + size_t{1}]; }
+    /// The lower corner.
+    Vec3d lo(size_t i) const {
+        const Lattice lattice = table_.lattice(depth_);
+        Vec3d corner;
+        for (size_t a = 0; a < 3; ++a) {
+            corner[static_cast<int>(a)] =
+                lattice.size * static_cast<double>(lattice.first[a] + window_.cell(a, cells_[i]));
         }
+        return corner;
     }
 
   private:
     /// Of items of one voxel in the largest box.
     static constexpr int kMostLevels = 11;
-    static constexpr size_t kMost = 16;  // items of a window
 
     /// Up to the next nodes, where the walk then is, or the next tile.
     TRACK_APART void crossNodes() {

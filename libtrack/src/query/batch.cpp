@@ -43,7 +43,7 @@ void requireDensity(const Volume& volume, const char* instead) {
 }
 
 void requireSuperVoxels(const Volume& volume, const char* instead) {
-    if (!volume.hasSuperVoxels) {
+    if (!volume.hasSuperVoxels()) {
         throw Error(TRK_ERROR_NO_SIDECAR,
                     "grid " + volume.grid.name + ": this needs a sidecar, and none was found" +
                         (volume.sidecarPath.empty() ? "" : " at " + volume.sidecarPath) +

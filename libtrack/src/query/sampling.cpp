@@ -27,7 +27,7 @@ void sampleOne(const Volume& volume, const TrkQuery& query, const TrkRay& ray, s
         TrackingSettings settings = trackingSettings(query, clipped->lengthPerVoxel);
         settings.wantsExtinction = static_cast<bool>(out.extinction);
         const typename V::Extinction extinction(volume);
-        const typename V::Walk superVoxels{volume.tracked()};
+        const typename V::Walk superVoxels(volume);
         Rng rng(query.seed, query.stream, rayIdAt(query, i), 0, Purpose::kFreePath);
         path = query.method == TRK_METHOD_DELTA
                    ? sampleFreePath<false>(extinction, superVoxels, clipped->local, settings, rng,

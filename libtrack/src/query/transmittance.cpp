@@ -32,10 +32,10 @@ void checkMethod(const Volume& volume, const TrkQuery& query) {
     if (method.usesSuperVoxels) {
         requireSuperVoxels(volume, method.usesDensity ? ", or use TRK_METHOD_EXACT" : "");
     }
-    if (method.hasLevels() && query.level > volume.superVoxels.levelCount()) {
+    if (method.hasLevels() && query.level > volume.superVoxels->levelCount()) {
         throw Error(TRK_ERROR_INVALID_ARGUMENT,
                     "level " + std::to_string(query.level) + ": expected 0 to " +
-                        std::to_string(volume.superVoxels.levelCount()) +
+                        std::to_string(volume.superVoxels->levelCount()) +
                         ", the levels of this sidecar");
     }
 }
@@ -44,7 +44,7 @@ void checkMethod(const Volume& volume, const TrkQuery& query) {
 ControlKind controlKind(const Volume& volume, const TrkQuery& query) {
     const MethodTraits& method = traitsOf(query.method);
     return method.usesChoice()  ? volume.tracked().kind()
-           : method.hasLevels() ? volume.superVoxels.kind()
+           : method.hasLevels() ? volume.superVoxels->kind()
                                 : ControlKind::kConstant;
 }
 
@@ -55,7 +55,7 @@ std::array<double, V::kChannels> deterministicDepth(const Volume& volume, const 
                                                     PathCost& cost) {
     const bool exact = traitsOf(query.method).isUnbiased;
     const auto clipped =
-        volume.clip(ray, exact ? volume.field->box() : volume.superVoxels.box(query.level));
+        volume.clip(ray, exact ? volume.field->box() : volume.superVoxels->box(query.level));
     if (!clipped) {
         return {};
     }
@@ -64,8 +64,7 @@ std::array<double, V::kChannels> deterministicDepth(const Volume& volume, const 
         return exactOpticalDepth(typename V::Extinction(volume), clipped->local,
                                  clipped->lengthPerVoxel, cost);
     }
-    auto depth =
-        V::integrateControl(volume.superVoxels, clipped->local, query.level, cost.superVoxels);
+    auto depth = V::integrateControl(volume, clipped->local, query.level, cost.superVoxels);
     for (double& d : depth) {
         d *= clipped->lengthPerVoxel;
     }
@@ -122,7 +121,7 @@ Estimate<V::kChannels> estimateRandomly(const Volume& volume, const TrkQuery& qu
     const TrackingSettings settings = trackingSettings(query, clipped.lengthPerVoxel);
     const LocalRay& ray = clipped.local;
     const typename V::Extinction extinction(volume);
-    const typename V::Walk superVoxels{volume.tracked()};
+    const typename V::Walk superVoxels(volume);
     SampleMean<V::kChannels> mean;
     for (uint32_t i = 0; i < query.samples; ++i) {
         Rng rng(query.seed, query.stream, rayId, i);
@@ -235,13 +234,13 @@ union Room {
 
 /// By ratio tracking (residual or not): several rays in flight, so that one's look-ups come from
 /// memory while others walk.
-template <class V, class Method>
+template <class V, Control kControl>
 class Flight {
   public:
     static constexpr size_t kRays = 8;
 
     Flight(const Volume& volume, const TrkQuery& query)
-        : volume_(volume), query_(query), extinction_(volume), superVoxels_{volume.tracked()} {}
+        : volume_(volume), query_(query), extinction_(volume), superVoxels_(volume) {}
 
     /// Of `count` rays, kRays at most.
     void estimate(const TrkRay* rays, size_t first, size_t count, const RayOutput<V>& output) {
@@ -265,7 +264,7 @@ class Flight {
     }
 
   private:
-    using Walk = RatioWalk<Method, typename V::Extinction, typename V::Walk, Rng>;
+    using Walk = RatioWalk<kControl, typename V::Extinction, typename V::Walk, Rng>;
     struct Lane {
         Lane(size_t ray, const ClippedRay& part, const TrackingSettings& how)
             : index(ray), clipped(part), settings(how) {}
@@ -318,10 +317,10 @@ class Flight {
     Room<Lane> lanes_[kRays];
 };
 
-template <class V, class Method>
+template <class V, Control kControl>
 void estimateByFlights(const Volume& volume, const TrkQuery& query, const TrkRay* rays,
                        size_t begin, size_t end, const RayOutput<V>& output) {
-    Flight<V, Method> flight(volume, query);
+    Flight<V, kControl> flight(volume, query);
     for (size_t i = begin; i < end; i += flight.kRays) {
         flight.estimate(rays, i, std::min(flight.kRays, end - i), output);
     }
@@ -332,12 +331,12 @@ void estimateRange(const Volume& volume, const TrkQuery& query, const TrkRay* ra
                    size_t end, const RayOutput<V>& output) {
     const MethodTraits& method = traitsOf(query.method);
     if (method.usesRoulette && method.usesControl) {
-        estimateByFlights<V, ResidualControl>(volume, query, rays, begin, end, output);
+        estimateByFlights<V, Control::kChosen>(volume, query, rays, begin, end, output);
         return;
     }
     if constexpr (V::kKind == ControlKind::kConstant) {  // or none is looked at: see controlKind
         if (method.usesRoulette) {
-            estimateByFlights<V, NoControl>(volume, query, rays, begin, end, output);
+            estimateByFlights<V, Control::kNone>(volume, query, rays, begin, end, output);
             return;
         }
     }

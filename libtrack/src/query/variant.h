@@ -6,6 +6,7 @@
 #include "control/super_voxels.h"
 #include "volume.h"
 
+#include <algorithm>
 #include <array>
 #include <cstddef>
 #include <cstdint>
@@ -22,22 +23,39 @@ struct Variant {
     static constexpr ControlKind kKind = K;
     using Extinction = VolumeExtinction<F, C>;
 
-    /// The volume's super-voxels as estimators walk them.
-    struct Walk {
-        const SuperVoxels& superVoxels;
+    /// The volume's super-voxels as plans are made of them.
+    class Walk {
+      public:
+        static constexpr size_t kChannels = C;
+        static constexpr ControlKind kKind = K;
 
-        template <class Visit>
-        void walk(const LocalRay& ray, double t0, double t1, Visit&& visit) const {
-            superVoxels.walk<C, K>(ray, t0, t1, visit);
+        /// By the super-voxels that random methods walk.
+        explicit Walk(const Volume& volume)
+            : superVoxels_(volume.tracked()), choice_(volume.controlChoice) {
+            std::copy_n(volume.scales.begin(), C, scales_.begin());
         }
-        SuperVoxelCursor<C, K> cursor(const LocalRay& ray, double t0, double t1) const {
-            return {superVoxels, ray, t0, t1};
+        double scale(size_t channel) const { return scales_[channel]; }
+        const ControlChoice& choice() const { return choice_; }
+
+        SuperVoxelCursor<F, K> cursor(const LocalRay& ray, double t0, double t1) const {
+            return {superVoxels_, ray, t0, t1};
         }
+
+      private:
+        const SuperVoxels& superVoxels_;
+        ControlChoice choice_;
+        std::array<double, C> scales_;
     };
-    static std::array<double, C> integrateControl(const SuperVoxels& superVoxels,
-                                                  const LocalRay& ray, size_t level,
-                                                  uint64_t& regions) {
-        return superVoxels.integrateControl<C, K>(ray, level, regions);
+    /// Integral of the baked control extinction of a level over the ray, times the length of a
+    /// voxel.
+    static std::array<double, C> integrateControl(const Volume& volume, const LocalRay& ray,
+                                                  size_t level, uint64_t& regions) {
+        const auto density = volume.superVoxels->integrateControl<F, K>(ray, level, regions);
+        std::array<double, C> result;
+        for (size_t c = 0; c < C; ++c) {
+            result[c] = volume.scales[c] * density[F == 1 ? 0 : c];
+        }
+        return result;
     }
 };
 
@@ -61,7 +79,7 @@ void withVariant(const Volume& volume, ControlKind kind, const Body& body) {
     constexpr std::integral_constant<size_t, 3> kThree;
     if (volume.channels() == 1) {
         withKind(kOne, kOne);
-    } else if (volume.hasDensity() && volume.field->channels() == 1) {
+    } else if (volume.densityChannels() == 1) {
         withKind(kOne, kThree);
     } else {
         withKind(kThree, kThree);

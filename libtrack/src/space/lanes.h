@@ -5,6 +5,7 @@
 
 #include <cstddef>
 #include <cstdint>
+#include <cstring>
 
 namespace trk {
 
@@ -13,5 +14,27 @@ using Float8 = float __attribute__((vector_size(32)));
 using Double2 = double __attribute__((vector_size(16)));
 using Double4 = double __attribute__((vector_size(32)));
 using Int4 = int32_t __attribute__((vector_size(16)));
+
+inline void load(const double* from, Double4& to) {
+    std::memcpy(&to, from, sizeof(to));
+}
+inline void load(const int32_t* from, Double4& to) {
+    Int4 integers;
+    std::memcpy(&integers, from, sizeof(integers));
+    to = __builtin_convertvector(integers, Double4);
+}
+inline void store(const Double4& from, double* to) {
+    std::memcpy(to, &from, sizeof(from));
+}
+
+/// The lesser and the greater, of numbers or of lanes.
+template <class Real>
+void takeLesser(const Real& than, Real& value) {
+    value = than < value ? than : value;
+}
+template <class Real>
+void takeGreater(const Real& than, Real& value) {
+    value = than > value ? than : value;
+}
 
 }  // namespace trk

@@ -54,14 +54,14 @@ struct LatticeWindow {
     size_t padded() const { return (count + kPad - 1) / kPad * kPad; }
     static constexpr size_t kPad = 16;
 
-    uint32_t crossed[kMost];  // planes of each axis before a cell, ten bits each
+    uint32_t crossed[kMost + kPad];  // planes of each axis before a cell, ten bits each
     int32_t start[3];
     int32_t sign[3] = {0, 0, 0};
 };
 
 /// A ray's way through a lattice, which may stop anywhere and go on. A ray meets the planes of an
 /// axis at equal intervals. Times are whole numbers of a very small unit, so that sums of them are
-/// exact, and a step (which plane is next, in what cell) takes a few cycles and no branch.
+/// exact, and a step (which plane is next, in what cell) takes a few cycles.
 class LatticeWalk {
   public:
     /// Along [t0, t1] of the ray from `cell` on, which holds its start.
@@ -127,10 +127,11 @@ class LatticeWalk {
         size_t n = 0;
         window.time[0] = timeOf(plane);
         do {
-            // Not by branches: nobody could predict them. Through an edge, two planes at once.
             plane = std::min(std::min(tX, tY), tZ);
             window.crossed[n++] = crossed;
             window.time[n] = timeOf(plane);
+            // Through an edge, two planes at once. (By masks instead of branches, which compilers
+            // make of this, it takes as long.)
             crossed += static_cast<uint32_t>(plane == tX) +
                        (static_cast<uint32_t>(plane == tY) << 10) +
                        (static_cast<uint32_t>(plane == tZ) << 20);
@@ -147,9 +148,7 @@ class LatticeWalk {
         next_[1] = tY;
         next_[2] = tZ;
         window.count = n;
-        for (; n % LatticeWindow<N>::kPad != 0; ++n) {
-            window.crossed[n] = 0;
-        }
+        std::memset(window.crossed + n, 0, sizeof(uint32_t) * LatticeWindow<N>::kPad);
         for (size_t a = 0; a < 3; ++a) {
             window.start[a] = cell_[a];
             window.sign[a] = sign_[a];

@@ -6,6 +6,7 @@
 #include "estimate/rng.h"
 #include "estimate/scaled_product.h"
 #include "field/density_field.h"
+#include "field/table_builder.h"
 #include "query/variant.h"
 #include "space/geometry.h"
 
@@ -164,10 +165,10 @@ TEST(SuperVoxels, BoundsCoverTheResidualOfEveryChoice) {
     for (const TrkChoice choice :
          {TRK_CHOICE_ROBUST, TRK_CHOICE_MEAN, TRK_CHOICE_MIN, TRK_CHOICE_MAX}) {
         trk::BakedVolume baked;
-        baked.table = trk::SparseTable(4, {{{0, 0, 0}}, {{16, 16, 16}}});
-        baked.table.fill(
-            {}, [](const trk::Int3&, int) { return std::nullopt; },
-            [](const trk::Int3&) { return 1u; });
+        baked.table = trk::TableBuilder(4, {{{0, 0, 0}}, {{16, 16, 16}}})
+                          .fill(
+                              {}, [](const trk::Int3&, int) { return std::nullopt; },
+                              [](const trk::Int3&) { return 1u; });
         baked.items.push_back({0.1f, 0.7f, 0.3f, 0.2f, 0.4f, 0.2f});
         const float scale = 3.3f;
         trk::Volume opened;

@@ -3,6 +3,7 @@
 #include "bake/bake.h"
 #include "bake/verify.h"
 #include "failure.h"
+#include "field/table_builder.h"
 #include "io/density.h"
 #include "io/sidecar.h"
 
@@ -231,11 +232,13 @@ TEST(PagedVerify, ProvesAndFindsTheSame) {
             EXPECT_FALSE(same().holds);
             sidecar.baked.items = baked.items;
             const auto first = static_cast<trk::SparseTable::Entry>(baked.items.size() * part / 4);
-            sidecar.baked.table = baked.table.mapped([&](trk::SparseTable::Entry e) {
-                return trk::SparseTable::index(e) >= first ? trk::SparseTable::kEmpty : e;
-            });
+            sidecar.baked.table =
+                trk::TableBuilder::mapped(baked.table, [&](trk::SparseTable::Entry e) {
+                    return trk::SparseTable::index(e) >= first ? trk::SparseTable::kEmpty : e;
+                });
             EXPECT_NE(same().counterexample.find("not in the sidecar"), std::string::npos);
-            sidecar.baked.table = baked.table.mapped([](trk::SparseTable::Entry e) { return e; });
+            sidecar.baked.table =
+                trk::TableBuilder::mapped(baked.table, [](trk::SparseTable::Entry e) { return e; });
         }
     }
 }

@@ -1,6 +1,7 @@
 // SPDX-License-Identifier: Apache-2.0
 // The sidecar: what is written is read, and nothing that does not fit is accepted.
 #include "io/sidecar.h"
+#include "field/table_builder.h"
 
 #include "bake/bake.h"
 #include "bake/verify.h"
@@ -431,20 +432,21 @@ TEST(Verify, FindsAMissingHaloAroundATile) {
     wrong.baked.superVoxelShift = 3;
     const int64_t lo = -density.summary.anchor[0];
     wrong.baked.table =
-        trk::SparseTable(3, {{{lo - 8, lo - 8, lo - 8}}, {{lo + 128, lo + 128, lo + 128}}});
-    wrong.baked.table.fill(
-        {}, [](const trk::Int3&, int) { return std::nullopt; },
-        [](const trk::Int3&) { return 1u; });
+        trk::TableBuilder(3, {{{lo - 8, lo - 8, lo - 8}}, {{lo + 128, lo + 128, lo + 128}}})
+            .fill(
+                {}, [](const trk::Int3&, int) { return std::nullopt; },
+                [](const trk::Int3&) { return 1u; });
     wrong.baked.items.push_back({1, 1, 1, 0, 0, 0});
     EXPECT_NE(vdbtools::verify(density.summary, wrong).counterexample, "");
-    wrong.baked.table = trk::SparseTable(3, {{{lo, lo, lo}}, {{lo + 128, lo + 128, lo + 128}}});
-    wrong.baked.table.fill(
-        {},
-        [&](const trk::Int3& at, int) -> std::optional<trk::SparseTable::Entry> {
-            const bool in = at[0] >= lo && at[1] >= lo && at[2] >= lo;
-            return in ? 1u : 0u;
-        },
-        [](const trk::Int3&) { return 1u; });
+    wrong.baked.table =
+        trk::TableBuilder(3, {{{lo, lo, lo}}, {{lo + 128, lo + 128, lo + 128}}})
+            .fill(
+                {},
+                [&](const trk::Int3& at, int) -> std::optional<trk::SparseTable::Entry> {
+                    const bool in = at[0] >= lo && at[1] >= lo && at[2] >= lo;
+                    return in ? 1u : 0u;
+                },
+                [](const trk::Int3&) { return 1u; });
     EXPECT_NE(vdbtools::verify(density.summary, wrong).counterexample.find("min 1"),
               std::string::npos);
 }
@@ -485,12 +487,13 @@ TEST(Verify, ProvesAGoodBakeAndFindsEveryLie) {
     holed.anchor = sidecar.anchor;
     holed.baked.superVoxelShift = sidecar.baked.superVoxelShift;
     holed.baked.items = sidecar.baked.items;
-    holed.baked.table = sidecar.baked.table.mapped([&](trk::SparseTable::Entry e) {
-        if (dropped == 0) {
-            dropped = e;
-        }
-        return e == dropped ? trk::SparseTable::kEmpty : e;
-    });
+    holed.baked.table =
+        trk::TableBuilder::mapped(sidecar.baked.table, [&](trk::SparseTable::Entry e) {
+            if (dropped == 0) {
+                dropped = e;
+            }
+            return e == dropped ? trk::SparseTable::kEmpty : e;
+        });
     EXPECT_NE(
         vdbtools::verify(baked.density.summary, holed).counterexample.find("not in the sidecar"),
         std::string::npos);

@@ -1,4 +1,5 @@
 // SPDX-License-Identifier: Apache-2.0
+#include "field/table_builder.h"
 #include "field/table_cursor.h"
 
 #include <gtest/gtest.h>
@@ -16,6 +17,7 @@ using trk::Int3;
 using trk::IntBox;
 using trk::LocalRay;
 using trk::SparseTable;
+using trk::TableBuilder;
 using trk::Vec3d;
 
 IntBox cube(int64_t size) {
@@ -24,16 +26,15 @@ IntBox cube(int64_t size) {
 
 /// A table of items of 8^3 voxels, occupied by a hash of the position.
 SparseTable randomTable(int64_t size) {
-    SparseTable table(3, cube(size));
-    table.fill(
-        {}, [](const Int3&, int) { return std::nullopt; },
-        [](const Int3& at) {
-            const auto hash =
-                static_cast<uint64_t>(at[0] * 73856093 ^ at[1] * 19349663 ^ at[2] * 83492791);
-            return hash % 3 == 0 ? static_cast<SparseTable::Entry>(1 + hash % 1000)
-                                 : SparseTable::kEmpty;
-        });
-    return table;
+    return TableBuilder(3, cube(size))
+        .fill(
+            {}, [](const Int3&, int) { return std::nullopt; },
+            [](const Int3& at) {
+                const auto hash =
+                    static_cast<uint64_t>(at[0] * 73856093 ^ at[1] * 19349663 ^ at[2] * 83492791);
+                return hash % 3 == 0 ? static_cast<SparseTable::Entry>(1 + hash % 1000)
+                                     : SparseTable::kEmpty;
+            });
 }
 
 LocalRay makeRay(const Vec3d& origin, const Vec3d& direction, double tEnd) {
@@ -81,10 +82,11 @@ TEST(SparseTable, FindsWhatWasFilled) {
 }
 
 TEST(SparseTable, FullTableCoversTheWholeInterval) {
-    SparseTable table(3, cube(256));
-    table.fill(
-        {}, [](const Int3&, int) { return std::nullopt; },
-        [](const Int3& at) { return static_cast<SparseTable::Entry>(1 + at[0]); });
+    const SparseTable table =
+        TableBuilder(3, cube(256))
+            .fill(
+                {}, [](const Int3&, int) { return std::nullopt; },
+                [](const Int3& at) { return static_cast<SparseTable::Entry>(1 + at[0]); });
     std::mt19937_64 random(7);
     std::uniform_real_distribution<double> unit(0, 1);
     std::vector<LocalRay> rays;
@@ -123,7 +125,7 @@ TEST(SparseTable, FullTableCoversTheWholeInterval) {
 /// Nodes below nodes, links, tiles and empty regions of all sizes: items at random, in clusters and
 /// alone, and boxes.
 SparseTable deepTable(int64_t size, uint64_t seed) {
-    SparseTable table(3, cube(size));
+    TableBuilder table(3, cube(size));
     std::mt19937_64 random(seed);
     std::uniform_int_distribution<int64_t> place(0, size / 8 - 1);
     std::set<Int3> items;
@@ -138,7 +140,7 @@ SparseTable deepTable(int64_t size, uint64_t seed) {
             items.insert(item);
         }
     }
-    std::vector<SparseTable::Place> places;
+    std::vector<TableBuilder::Place> places;
     const IntBox box{{{size / 2, size / 4, 64}}, {{size / 2 + 1032, size / 4 + 512, 1064}}};
     table.addBox(box, 7, places);
     for (const Int3& item : items) {
@@ -151,8 +153,7 @@ SparseTable deepTable(int64_t size, uint64_t seed) {
             places.push_back({lo, 3, static_cast<SparseTable::Entry>(1 + random() % 1000)});
         }
     }
-    table.assemble(places);
-    return table;
+    return table.assemble(places);
 }
 
 TEST(SparseTable, AWalkMeetsJustWhatIsFoundPointByPoint) {
@@ -238,8 +239,8 @@ TEST(SparseTable, FlattenedTablesAreWalkedAlike) {
     }
     EXPECT_GT(met, 1000u);
     // Where little of the box is occupied, that is not worth it.
-    SparseTable corners(3, cube(256));
-    corners.assemble({{{{0, 0, 0}}, 3, 1}, {{{248, 248, 248}}, 3, 2}});
+    const SparseTable corners =
+        TableBuilder(3, cube(256)).assemble({{{{0, 0, 0}}, 3, 1}, {{{248, 248, 248}}, 3, 2}});
     const SparseTable same = SparseTable(corners).flattened();
     EXPECT_EQ(same.depth(), corners.depth());
     EXPECT_EQ(same.find(250, 250, 250).entry, 2u);
@@ -273,19 +274,20 @@ TEST(SparseTable, WalkMeetsWhatDenseSamplingMeets) {
 
 TEST(SparseTable, CrossesAHugeGapInAFewSteps) {
     constexpr int64_t kFar = int64_t{1} << 31;
-    SparseTable table(3, cube(kFar + 8));
     int asked = 0;
-    table.fill(
-        {},
-        [&](const Int3& at, int shift) -> std::optional<SparseTable::Entry> {
-            ++asked;
-            const int64_t size = int64_t{1} << shift;
-            const bool near = at[0] == 0 && at[1] == 0 && at[2] == 0;
-            const bool far = at[0] <= kFar && at[0] + size > kFar && at[1] <= kFar &&
-                             at[1] + size > kFar && at[2] <= kFar && at[2] + size > kFar;
-            return near || far ? std::nullopt : std::optional(SparseTable::kEmpty);
-        },
-        [](const Int3& at) { return at[0] == 0 ? 1u : 2u; });
+    const SparseTable table =
+        TableBuilder(3, cube(kFar + 8))
+            .fill(
+                {},
+                [&](const Int3& at, int shift) -> std::optional<SparseTable::Entry> {
+                    ++asked;
+                    const int64_t size = int64_t{1} << shift;
+                    const bool near = at[0] == 0 && at[1] == 0 && at[2] == 0;
+                    const bool far = at[0] <= kFar && at[0] + size > kFar && at[1] <= kFar &&
+                                     at[1] + size > kFar && at[2] <= kFar && at[2] + size > kFar;
+                    return near || far ? std::nullopt : std::optional(SparseTable::kEmpty);
+                },
+                [](const Int3& at) { return at[0] == 0 ? 1u : 2u; });
     EXPECT_LT(asked, 100000);
     EXPECT_LT(table.bytes(), 500000u);
     const double half = 0.5 * std::sqrt(3.0);
@@ -306,7 +308,7 @@ struct Effort {
 Effort effortOf(size_t count) {
     constexpr int64_t kWide = int64_t{1} << 31;
     std::mt19937_64 random(5);
-    std::vector<SparseTable::Place> places;
+    std::vector<TableBuilder::Place> places;
     for (size_t i = 0; i < count; ++i) {
         Int3 lo;
         for (int64_t& x : lo) {
@@ -314,29 +316,30 @@ Effort effortOf(size_t count) {
         }
         places.push_back({lo, 3, static_cast<SparseTable::Entry>(i + 1)});
     }
-    SparseTable table(3, cube(kWide));
-    table.assemble(places);
+    const SparseTable table = TableBuilder(3, cube(kWide)).assemble(places);
     for (const auto& place : places) {
         EXPECT_EQ(table.find(place.lo[0], place.lo[1], place.lo[2]).entry, place.entry);
     }
     EXPECT_EQ(table.occupiedItems(), count);
     const auto n = static_cast<double>(count);
     Effort effort{0, 0, static_cast<double>(table.bytes()) / n};
-    SparseTable coarse(4, cube(kWide));
-    coarse.fill(
-        {&table},
-        [&](const Int3& at, int shift) {
-            ++effort.asked;
-            const auto entry = table.uniformEntry(at, shift);
-            return entry && *entry == SparseTable::kEmpty ? entry : std::nullopt;
-        },
-        [](const Int3&) { return 7u; });
+    const SparseTable coarse =
+        TableBuilder(4, cube(kWide))
+            .fill(
+                {&table},
+                [&](const Int3& at, int shift) {
+                    ++effort.asked;
+                    const auto entry = table.uniformEntry(at, shift);
+                    return entry && *entry == SparseTable::kEmpty ? entry : std::nullopt;
+                },
+                [](const Int3&) { return 7u; });
     EXPECT_EQ(coarse.occupiedItems(), count);
-    SparseTable neighbours(3, cube(kWide));
-    neighbours.fillFrom(table, [&](const SparseTable::Corners& corners, int) {
-        ++effort.given;
-        return std::optional(corners[0]);
-    });
+    const SparseTable neighbours =
+        TableBuilder(3, cube(kWide))
+            .fillFrom(table, [&](const TableBuilder::Corners& corners, int) {
+                ++effort.given;
+                return std::optional(corners[0]);
+            });
     EXPECT_EQ(neighbours.occupiedItems(), count);
     effort.asked /= n;
     effort.given /= n;
@@ -356,7 +359,7 @@ TEST(SparseTable, WorkGoesWithContentHoweverScattered) {
 TEST(SparseTable, MappingCollapsesWhatBecameUniform) {
     const SparseTable table = randomTable(64);
     const SparseTable collapsed =
-        table.mapped([](SparseTable::Entry) { return SparseTable::kEmpty; });
+        TableBuilder::mapped(table, [](SparseTable::Entry) { return SparseTable::kEmpty; });
     size_t occupied = 0;
     collapsed.forEach([&](const Int3&, int, SparseTable::Entry) { ++occupied; });
     EXPECT_EQ(occupied, 0u);

@@ -3,6 +3,7 @@
 #pragma once
 
 #include "field/sparse_table.h"
+#include "field/table_builder.h"
 #include "io/density_types.h"
 #include "io/vdb_tree.h"
 #include "space/geometry.h"
@@ -62,7 +63,7 @@ class Voxels {
             box.add(blocks_.back().lo, blocks_.back().hi);
         };
         // What is 0 everywhere may lie where there is no local space.
-        std::vector<SparseTable::Place> places;
+        std::vector<trk::TableBuilder::Place> places;
         for (size_t i = 0; i < source.leafCount(); ++i) {
             if (occupied[i]) {
                 add(source.leafOrigins()[i], kLeafShift);
@@ -78,11 +79,11 @@ class Voxels {
                 tiles.emplace_back(blocks_.back(), constantEntry(value));
             }
         }
-        table_ = SparseTable(kLeafShift, box);
+        trk::TableBuilder table(kLeafShift, box);
         for (const auto& [tileBox, entry] : tiles) {
-            table_.addBox(tileBox, entry, places);
+            table.addBox(tileBox, entry, places);
         }
-        table_.assemble(std::move(places));
+        table_ = table.assemble(std::move(places));
     }
 
     /// Calls body(begin, end) for parts of [0, count), in order, until it answers false, while the

@@ -2,6 +2,7 @@
 #include "lit_preview.h"
 
 #include "failure.h"
+#include "field/table_builder.h"
 #include "io/sidecar.h"
 #include "io/sidecar_schema.h"
 #include "parallel.h"
@@ -256,21 +257,22 @@ void LitPreview::tabulateLight() {
         places += static_cast<size_t>((cells + 1) * (cells + 1) * (cells + 1));
         return static_cast<SparseTable::Entry>(regions_.size());
     };
-    table_ = SparseTable(DensityField::kBrickShift, field.box());
-    table_.fill(
-        {&field.table()},
-        [&](const Int3& origin, int shift) -> std::optional<SparseTable::Entry> {
-            const auto found = field.table().find(origin[0], origin[1], origin[2]);
-            if (found.shift < shift || !DensityField::isConstant(found.entry)) {
-                return std::nullopt;
-            }
-            return found.entry == SparseTable::kEmpty ? SparseTable::kEmpty
-                                                      : add(origin, shift, found.entry);
-        },
-        [&](const Int3& origin) {
-            const auto found = field.table().find(origin[0], origin[1], origin[2]);
-            return add(origin, DensityField::kBrickShift, found.entry);
-        });
+    table_ = trk::TableBuilder(DensityField::kBrickShift, field.box())
+                 .fill(
+                     {&field.table()},
+                     [&](const Int3& origin, int shift) -> std::optional<SparseTable::Entry> {
+                         const auto found = field.table().find(origin[0], origin[1], origin[2]);
+                         if (found.shift < shift || !DensityField::isConstant(found.entry)) {
+                             return std::nullopt;
+                         }
+                         return found.entry == SparseTable::kEmpty
+                                    ? SparseTable::kEmpty
+                                    : add(origin, shift, found.entry);
+                     },
+                     [&](const Int3& origin) {
+                         const auto found = field.table().find(origin[0], origin[1], origin[2]);
+                         return add(origin, DensityField::kBrickShift, found.entry);
+                     });
     light_.resize(places);
     trk::parallelFor(regions_.size(), 1, [&](size_t r) {
         const Region& region = regions_[r];

@@ -3,6 +3,7 @@
 
 #include "control_fit.h"
 #include "failure.h"
+#include "field/table_builder.h"
 #include "levels.h"
 #include "moments.h"
 #include "parallel.h"
@@ -85,7 +86,6 @@ class Baker {
     /// Which super-voxels there are, equal ones once: their places in `jobs_`, in `plan_` the index
     /// of each, plus one.
     void planSuperVoxels() {
-        plan_ = SparseTable(shift_, field_.box());
         const Entry single = kind_ == ControlKind::kConstant ? 0 : SparseTable::kSingleFlag;
         const auto addJob = [&](const Int3& origin) {
             jobs_.push_back(origin);
@@ -95,27 +95,28 @@ class Baker {
             return static_cast<Entry>(jobs_.size());
         };
         std::unordered_map<Entry, Entry> constants;
-        plan_.fill(
-            {&field_.table()},
-            [&](const Int3& origin, int shift) -> std::optional<Entry> {
-                const auto entry = field_.table().uniformEntry(origin, shift);
-                if (!entry || !DensityField::isConstant(*entry)) {
-                    return std::nullopt;
-                }
-                if (*entry == SparseTable::kEmpty) {
-                    return SparseTable::kEmpty;
-                }
-                Entry& known = constants[*entry];
-                known = known == SparseTable::kEmpty ? addJob(origin) : known;
-                return known;
-            },
-            [&](const Int3& origin) { return addJob(origin) | single; },
-            // The surface of a large tile repeats a handful of patterns of bricks. Of a lone small
-            // super-voxel, to look for it costs more than to bake it.
-            [&](const Int3& origin, int shift, SparseTable::Key& key) {
-                return (shift > shift_ || shift > DensityField::kBrickShift) &&
-                       field_.table().appendKey(origin, shift, key);
-            });
+        plan_ = TableBuilder(shift_, field_.box())
+                    .fill(
+                        {&field_.table()},
+                        [&](const Int3& origin, int shift) -> std::optional<Entry> {
+                            const auto entry = field_.table().uniformEntry(origin, shift);
+                            if (!entry || !DensityField::isConstant(*entry)) {
+                                return std::nullopt;
+                            }
+                            if (*entry == SparseTable::kEmpty) {
+                                return SparseTable::kEmpty;
+                            }
+                            Entry& known = constants[*entry];
+                            known = known == SparseTable::kEmpty ? addJob(origin) : known;
+                            return known;
+                        },
+                        [&](const Int3& origin) { return addJob(origin) | single; },
+                        // The surface of a large tile repeats a handful of patterns of bricks. Of a
+                        // lone small super-voxel, to look for it costs more than to bake it.
+                        [&](const Int3& origin, int shift, SparseTable::Key& key) {
+                            return (shift > shift_ || shift > DensityField::kBrickShift) &&
+                                   field_.table().appendKey(origin, shift, key);
+                        });
     }
 
     /// A cube of a super-voxel.
@@ -266,7 +267,8 @@ class Baker {
                 itemOf[i] |= isHomogeneous(i) ? 0 : SparseTable::kSingleFlag;
             }
         }
-        baked_.table = plan_.mapped([&](Entry entry) { return itemOf[SparseTable::index(entry)]; });
+        baked_.table = TableBuilder::mapped(
+            plan_, [&](Entry entry) { return itemOf[SparseTable::index(entry)]; });
     }
 
     /// Of a job that becomes an item.
@@ -304,30 +306,31 @@ class Baker {
             }
             return it->second;
         };
-        baked_.table = SparseTable(shift_, field_.box());
-        baked_.table.fill(
-            {&plan_},
-            [&](const Int3& origin, int shift) -> std::optional<Entry> {
-                const auto entry = plan_.uniformEntry(origin, shift);
-                if (!entry) {
-                    return std::nullopt;
-                }
-                if (*entry == SparseTable::kEmpty || isEmpty(SparseTable::index(*entry))) {
-                    return SparseTable::kEmpty;
-                }
-                const size_t job = SparseTable::index(*entry);
-                const bool homogeneous = isHomogeneous(job);
-                if (!homogeneous && shift > shift_) {
-                    return std::nullopt;
-                }
-                for (size_t i = 0; i < shape.size(); ++i) {
-                    shape[i] = homogeneous
-                                   ? moments(job, i / 8).min
-                                   : cornerValue(fits[i / 8], cornerOf(origin, i % 8), i / 8);
-                }
-                return itemFor(job) | (homogeneous ? 0 : SparseTable::kSingleFlag);
-            },
-            [](const Int3&) { return SparseTable::kEmpty; });  // an item is always uniform
+        baked_.table =
+            TableBuilder(shift_, field_.box())
+                .fill(
+                    {&plan_},
+                    [&](const Int3& origin, int shift) -> std::optional<Entry> {
+                        const auto entry = plan_.uniformEntry(origin, shift);
+                        if (!entry) {
+                            return std::nullopt;
+                        }
+                        if (*entry == SparseTable::kEmpty || isEmpty(SparseTable::index(*entry))) {
+                            return SparseTable::kEmpty;
+                        }
+                        const size_t job = SparseTable::index(*entry);
+                        const bool homogeneous = isHomogeneous(job);
+                        if (!homogeneous && shift > shift_) {
+                            return std::nullopt;
+                        }
+                        for (size_t i = 0; i < shape.size(); ++i) {
+                            shape[i] = homogeneous ? moments(job, i / 8).min
+                                                   : cornerValue(fits[i / 8],
+                                                                 cornerOf(origin, i % 8), i / 8);
+                        }
+                        return itemFor(job) | (homogeneous ? 0 : SparseTable::kSingleFlag);
+                    },
+                    [](const Int3&) { return SparseTable::kEmpty; });  // an item is always uniform
     }
 
     /// A corner of the super-voxel at `origin`, counted in super-voxels.

@@ -1,6 +1,7 @@
 // SPDX-License-Identifier: Apache-2.0
 #include "levels.h"
 
+#include "field/table_builder.h"
 #include "hash.h"
 #include "moments.h"
 #include "parallel.h"
@@ -25,7 +26,6 @@ ValueTable nextLevel(const SparseTable& finer, const IntBox& box, size_t channel
     ValueTable level;
     const int shift = finer.itemShift() + 1;
     const int64_t half = int64_t{1} << finer.itemShift();
-    level.table = SparseTable(shift, box);
     using Mean = std::array<float, 3>;
     const auto hash = [](const Mean& mean) {
         uint64_t words[2] = {0, 0};
@@ -45,40 +45,42 @@ ValueTable nextLevel(const SparseTable& finer, const IntBox& box, size_t channel
         }
         return it->second;
     };
-    level.table.fill(
-        {&finer},
-        [&](const Int3& origin, int regionShift) -> std::optional<SparseTable::Entry> {
-            const auto entry = finer.uniformEntry(origin, regionShift);
-            if (!entry) {
-                return std::nullopt;
-            }
-            Mean mean{};
-            for (size_t c = 0; c < channels && *entry != SparseTable::kEmpty; ++c) {
-                mean[c] = meanOf(SparseTable::index(*entry), c);
-            }
-            return add(mean);
-        },
-        [&](const Int3& origin) {
-            double sum[3] = {0, 0, 0};
-            for (int64_t octant = 0; octant < 8; ++octant) {
-                const auto entry =
-                    finer
-                        .find(origin[0] + (octant >> 2) * half,
-                              origin[1] + (octant >> 1 & 1) * half, origin[2] + (octant & 1) * half)
-                        .entry;
-                for (size_t c = 0; c < channels && entry != SparseTable::kEmpty; ++c) {
-                    sum[c] += static_cast<double>(meanOf(SparseTable::index(entry), c));
-                }
-            }
-            Mean mean{};
-            for (size_t c = 0; c < channels; ++c) {
-                mean[c] = static_cast<float>(sum[c] / 8);
-            }
-            return add(mean);
-        },
-        [&](const Int3& origin, int regionShift, SparseTable::Key& key) {
-            return regionShift > shift && finer.appendKey(origin, regionShift, key);
-        });
+    level.table =
+        TableBuilder(shift, box)
+            .fill(
+                {&finer},
+                [&](const Int3& origin, int regionShift) -> std::optional<SparseTable::Entry> {
+                    const auto entry = finer.uniformEntry(origin, regionShift);
+                    if (!entry) {
+                        return std::nullopt;
+                    }
+                    Mean mean{};
+                    for (size_t c = 0; c < channels && *entry != SparseTable::kEmpty; ++c) {
+                        mean[c] = meanOf(SparseTable::index(*entry), c);
+                    }
+                    return add(mean);
+                },
+                [&](const Int3& origin) {
+                    double sum[3] = {0, 0, 0};
+                    for (int64_t octant = 0; octant < 8; ++octant) {
+                        const auto entry = finer
+                                               .find(origin[0] + (octant >> 2) * half,
+                                                     origin[1] + (octant >> 1 & 1) * half,
+                                                     origin[2] + (octant & 1) * half)
+                                               .entry;
+                        for (size_t c = 0; c < channels && entry != SparseTable::kEmpty; ++c) {
+                            sum[c] += static_cast<double>(meanOf(SparseTable::index(entry), c));
+                        }
+                    }
+                    Mean mean{};
+                    for (size_t c = 0; c < channels; ++c) {
+                        mean[c] = static_cast<float>(sum[c] / 8);
+                    }
+                    return add(mean);
+                },
+                [&](const Int3& origin, int regionShift, SparseTable::Key& key) {
+                    return regionShift > shift && finer.appendKey(origin, regionShift, key);
+                });
     return level;
 }
 
@@ -115,7 +117,6 @@ ValueTable meansOf(BrickPages& pages, int shift) {
         }
     });
     ValueTable means;
-    means.table = SparseTable(shift, field.box());
     const auto add = [&](const float* values) {
         if (std::all_of(values, values + channels, [](float v) { return v == 0; })) {
             return SparseTable::kEmpty;
@@ -124,27 +125,32 @@ ValueTable meansOf(BrickPages& pages, int shift) {
         return static_cast<SparseTable::Entry>(means.values.size() / channels);
     };
     std::map<SparseTable::Entry, SparseTable::Entry> constants;
-    means.table.fill(
-        {&field.table()},
-        [&](const Int3& origin, int regionShift) -> std::optional<SparseTable::Entry> {
-            const auto entry = field.table().uniformEntry(origin, regionShift);
-            if (!entry || !DensityField::isConstant(*entry)) {
-                return std::nullopt;
-            }
-            const auto known = constants.find(*entry);
-            return known != constants.end() ? known->second
-                                            : constants[*entry] = add(field.constant(*entry));
-        },
-        [&](const Int3& origin) {
-            const auto entry = field.table().find(origin[0], origin[1], origin[2]).entry;
-            const auto part = [&](size_t a) { return static_cast<size_t>(origin[a] & 7) / edge; };
-            const size_t k = (part(0) * perAxis + part(1)) * perAxis + part(2);
-            return add(&brickMeans[((entry - 1) * cubes + k) * channels]);
-        },
-        [&](const Int3& origin, int regionShift, SparseTable::Key& key) {
-            return regionShift > DensityField::kBrickShift &&
-                   field.table().appendKey(origin, regionShift, key);
-        });
+    means.table =
+        TableBuilder(shift, field.box())
+            .fill(
+                {&field.table()},
+                [&](const Int3& origin, int regionShift) -> std::optional<SparseTable::Entry> {
+                    const auto entry = field.table().uniformEntry(origin, regionShift);
+                    if (!entry || !DensityField::isConstant(*entry)) {
+                        return std::nullopt;
+                    }
+                    const auto known = constants.find(*entry);
+                    return known != constants.end()
+                               ? known->second
+                               : constants[*entry] = add(field.constant(*entry));
+                },
+                [&](const Int3& origin) {
+                    const auto entry = field.table().find(origin[0], origin[1], origin[2]).entry;
+                    const auto part = [&](size_t a) {
+                        return static_cast<size_t>(origin[a] & 7) / edge;
+                    };
+                    const size_t k = (part(0) * perAxis + part(1)) * perAxis + part(2);
+                    return add(&brickMeans[((entry - 1) * cubes + k) * channels]);
+                },
+                [&](const Int3& origin, int regionShift, SparseTable::Key& key) {
+                    return regionShift > DensityField::kBrickShift &&
+                           field.table().appendKey(origin, regionShift, key);
+                });
     return means;
 }
 

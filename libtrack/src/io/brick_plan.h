@@ -5,6 +5,7 @@
 
 #include "density_types.h"
 #include "field/density_field.h"
+#include "field/table_builder.h"
 #include "hash.h"
 #include "progress.h"
 #include "region_source.h"
@@ -81,7 +82,7 @@ template <class Value>
 class BrickPlan {
   public:
     using Entry = SparseTable::Entry;
-    using Corners = SparseTable::Corners;
+    using Corners = TableBuilder::Corners;
     using FieldValue = Sample<Value>;
 
     /// A brick whose values partly come from leaves, or are all given by constants: by region, an
@@ -96,15 +97,17 @@ class BrickPlan {
     /// size.
     BrickPlan(const RegionSource<Value>& source, const LeafTraits<Value>& leaves,
               const Int3& anchor, const IntBox& box)
-        : leaves_(leaves), table_(DensityField::kBrickShift, box) {
+        : leaves_(leaves) {
         for (size_t i = 0; i < leaves.alike.size(); ++i) {
             if (leaves.isConstant(i)) {
                 unused_.push_back(i);
             }
         }
         const SparseTable regions = sourceTable(source, anchor, box);
-        table_.fillFrom(regions,
-                        [&](const Corners& corners, int shift) { return entryOf(corners, shift); });
+        table_ = TableBuilder(DensityField::kBrickShift, box)
+                     .fillFrom(regions, [&](const Corners& corners, int shift) {
+                         return entryOf(corners, shift);
+                     });
     }
 
     /// The field's.
@@ -172,8 +175,8 @@ class BrickPlan {
     /// The regions of the source: leaves, and constants where a leaf or tile has one value.
     SparseTable sourceTable(const RegionSource<Value>& source, const Int3& anchor,
                             const IntBox& box) {
-        SparseTable table(DensityField::kBrickShift, box);
-        std::vector<SparseTable::Place> places;
+        TableBuilder table(DensityField::kBrickShift, box);
+        std::vector<TableBuilder::Place> places;
         places.reserve(source.leafCount());
         const auto local = [&](const Origin& o) {
             return Int3{{o[0] - anchor[0], o[1] - anchor[1], o[2] - anchor[2]}};
@@ -194,8 +197,7 @@ class BrickPlan {
                 table.addBox({lo, {{lo[0] + size, lo[1] + size, lo[2] + size}}}, entry, places);
             }
         }
-        table.assemble(std::move(places));
-        return table;
+        return table.assemble(std::move(places));
     }
 
     template <class BrickAt, class Stored>

@@ -8,6 +8,7 @@
 #include "density_types.h"
 #include "failure.h"
 #include "field/density_field.h"
+#include "field/table_builder.h"
 #include "parallel.h"
 #include "region_scan.h"
 #include "region_source.h"
@@ -182,8 +183,9 @@ DensityField FieldBuilder<Value>::finish(RawArray<Stored>& values, const Int3& a
             moved[slot + 1] = static_cast<Entry>(++next);
         }
         values.resize(next * kBrickValues);
-        table = table.mapped(
-            [&](Entry entry) { return DensityField::isConstant(entry) ? entry : moved[entry]; });
+        table = TableBuilder::mapped(table, [&](Entry entry) {
+            return DensityField::isConstant(entry) ? entry : moved[entry];
+        });
     }
     return {kChannels, std::move(table), plan.constants(), std::move(floats_), std::move(halfs_)};
 }

@@ -4,6 +4,7 @@
 #include "active_grid.h"
 #include "density_types.h"
 #include "failure.h"
+#include "field/table_builder.h"
 #include "hash.h"
 #include "sidecar_header.h"
 #include "sidecar_schema.h"
@@ -134,61 +135,67 @@ class SidecarReader {
         BakedVolume& baked = sidecar.baked;
         const bool trilinear = baked.kind == ControlKind::kTrilinear;
         std::unordered_map<Entries, SparseTable::Entry, Hash> known;
-        baked.table = SparseTable(shift_, toLocal(box_, sidecar.anchor));
-        SparseTable::Sources sources;
+        TableBuilder::Sources sources;
         for (const ValueTable& table : tables_) {
             sources.push_back(&table.table);
         }
-        baked.table.fill(
-            sources,
-            [&](const Int3& local, int shift) -> std::optional<SparseTable::Entry> {
-                Entries entries{};
-                size_t empty = 0;
-                for (size_t i = 0; i < tables_.size(); ++i) {
-                    const auto entry = tables_[i].table.uniformEntry(local, shift);
-                    if (!entry) {
-                        return std::nullopt;
-                    }
-                    entries[i] = *entry;
-                    empty += *entry == SparseTable::kEmpty ? 1 : 0;
-                }
-                if (empty == tables_.size()) {
-                    return SparseTable::kEmpty;
-                }
-                const Int3 at = gridIndex(local, shift_, sidecar.anchor);
-                if (empty > 0) {
-                    badSidecar(
-                        file_.path(),
-                        "its grids are not active in the same super-voxels: see " + where(at));
-                }
-                const bool varies = baked.kind != ControlKind::kConstant && !isHomogeneous(entries);
-                if (varies && shift > shift_) {
-                    return std::nullopt;
-                }
-                for (size_t corner = 0; varies && trilinear && corner < 8; ++corner) {
-                    const int64_t size = header_.superVoxelSize;
-                    entries[tables_.size() + corner] = corners_.table
-                                                           .find(local[0] + (corner & 4 ? size : 0),
-                                                                 local[1] + (corner & 2 ? size : 0),
-                                                                 local[2] + (corner & 1 ? size : 0))
-                                                           .entry;
-                }
-                const auto [it, isNew] =
-                    known.try_emplace(entries, static_cast<SparseTable::Entry>(known.size() + 1) |
-                                                   (varies ? SparseTable::kSingleFlag : 0));
-                if (isNew) {
-                    addItems(entries, varies, at, baked);
-                }
-                return it->second;
-            },
-            [](const Int3&) { return SparseTable::kEmpty; },  // a super-voxel is always uniform
-            [&](const Int3& local, int shift, SparseTable::Key& key) {
-                // Corners belong to neighbours too, which such a key does not know.
-                return !trilinear &&
-                       std::all_of(tables_.begin(), tables_.end(), [&](const ValueTable& table) {
-                           return table.table.appendKey(local, shift, key);
-                       });
-            });
+        baked.table =
+            TableBuilder(shift_, toLocal(box_, sidecar.anchor))
+                .fill(
+                    sources,
+                    [&](const Int3& local, int shift) -> std::optional<SparseTable::Entry> {
+                        Entries entries{};
+                        size_t empty = 0;
+                        for (size_t i = 0; i < tables_.size(); ++i) {
+                            const auto entry = tables_[i].table.uniformEntry(local, shift);
+                            if (!entry) {
+                                return std::nullopt;
+                            }
+                            entries[i] = *entry;
+                            empty += *entry == SparseTable::kEmpty ? 1 : 0;
+                        }
+                        if (empty == tables_.size()) {
+                            return SparseTable::kEmpty;
+                        }
+                        const Int3 at = gridIndex(local, shift_, sidecar.anchor);
+                        if (empty > 0) {
+                            badSidecar(file_.path(),
+                                       "its grids are not active in the same super-voxels: see " +
+                                           where(at));
+                        }
+                        const bool varies =
+                            baked.kind != ControlKind::kConstant && !isHomogeneous(entries);
+                        if (varies && shift > shift_) {
+                            return std::nullopt;
+                        }
+                        for (size_t corner = 0; varies && trilinear && corner < 8; ++corner) {
+                            const int64_t size = header_.superVoxelSize;
+                            entries[tables_.size() + corner] =
+                                corners_.table
+                                    .find(local[0] + (corner & 4 ? size : 0),
+                                          local[1] + (corner & 2 ? size : 0),
+                                          local[2] + (corner & 1 ? size : 0))
+                                    .entry;
+                        }
+                        const auto [it, isNew] = known.try_emplace(
+                            entries, static_cast<SparseTable::Entry>(known.size() + 1) |
+                                         (varies ? SparseTable::kSingleFlag : 0));
+                        if (isNew) {
+                            addItems(entries, varies, at, baked);
+                        }
+                        return it->second;
+                    },
+                    [](const Int3&) {
+                        return SparseTable::kEmpty;
+                    },  // a super-voxel is always uniform
+                    [&](const Int3& local, int shift, SparseTable::Key& key) {
+                        // Corners belong to neighbours too, which such a key does not know.
+                        return !trilinear &&
+                               std::all_of(tables_.begin(), tables_.end(),
+                                           [&](const ValueTable& table) {
+                                               return table.table.appendKey(local, shift, key);
+                                           });
+                    });
     }
 
     float valueOf(const ValueTable& table, SparseTable::Entry entry, size_t channel) const {
@@ -354,8 +361,7 @@ class SidecarReader {
         checkAnchor(placed.support, anchor, placed.name);
         const ActiveGrid& grid = placed.grid;
         ValueTable result;
-        SparseTable& table = result.table;
-        table = SparseTable(shift, toLocal(placed.support, anchor));
+        TableBuilder table(shift, toLocal(placed.support, anchor));
         ValueEntries entries(grid.channels, result.values);
         const auto entryOf = [&](const ActiveLeaf::Floats& value, const Int3& at) {
             for (size_t c = 0; c < grid.channels; ++c) {
@@ -379,7 +385,7 @@ class SidecarReader {
             ((int64_t{8} << shift) - 1);
         std::vector<SparseTable::Node> nodes(grid.leaves.size());
         std::vector<SparseTable::Entry> nodeEntries(grid.leaves.size());
-        std::vector<SparseTable::Place> places;
+        std::vector<TableBuilder::Place> places;
         std::vector<bool> made(grid.leaves.size());
         for (const auto& [origin, l] : grid.places) {
             const ActiveLeaf& leaf = grid.leaves[l];
@@ -407,7 +413,7 @@ class SidecarReader {
         for (const auto& [box, value] : grid.tiles) {
             table.addBox({local(box.lo), local(box.hi)}, entryOf(value, box.lo), places);
         }
-        table.assemble(std::move(places));
+        result.table = table.assemble(std::move(places));
         return result;
     }
 

@@ -66,7 +66,7 @@ void addValues(const std::string& path, const trk::VdbEntry& entry, Json& json) 
         json["openvdb_bytes"] = density.summary.gridBytes;
         json["brick_bytes"] = density.field.bytes();
         json["bricks"] = density.field.brickCount();
-        json["kernel"] = trk::kernelName();
+        json["kernel"] = trk::kernelName(trk::kDefaultKernel);
         json["brick_storage"] = density.field.isHalf() ? "half" : "float";
         json["can_be_baked"] = true;
     } catch (const trk::Error& e) {

@@ -6,6 +6,7 @@
 #include "failure.h"
 #include "io/output_file.h"
 #include "io/sidecar.h"
+#include "kernel.h"
 #include "measure/known_error.h"
 #include "names.h"
 #include "parallel.h"
@@ -304,6 +305,8 @@ TrkVolumeOptions volumeOptionsOf(const Arguments& arguments) {
     options.repair = repairBits(arguments);
     options.maxMemory = memoryLimit(arguments);
     options.gridName = arguments.has("grid") ? arguments.get<std::string>("grid").c_str() : nullptr;
+    options.kernel =
+        arguments.has("kernel") ? arguments.get<std::string>("kernel").c_str() : nullptr;
     return options;
 }
 
@@ -383,6 +386,11 @@ trk::Volume openInside(const Inputs& inputs) {
     options.global = inputs.options.global != 0;
     options.repair = inputs.options.repair;
     options.maxMemory = inputs.options.maxMemory;
+    if (inputs.options.kernel) {
+        const std::string name = inputs.options.kernel;
+        options.kernel = name == trk::kernelName(trk::Kernel::kAvx2) ? trk::Kernel::kAvx2
+                                                                     : trk::Kernel::kBaseline;
+    }
     options.bakeMissing = true;
     trk::Volume volume = trk::openVolume(inputs.density.c_str(), inputs.sidecar(), options);
     return volume;
@@ -440,6 +448,8 @@ void run(const Command& command, const std::vector<std::string>& given) {
                            "take the whole volume for one super-voxel with a constant control: "
                            "for comparison")("level", po::value<int>()->default_value(0),
                                              "preview level of the control method")(
+        "kernel", po::value<std::string>(),
+        "baseline or avx2: whose code runs; by default the best of this processor")(
         "seed", po::value<uint64_t>()->default_value(0), "of the random numbers")(
         "stream", po::value<uint64_t>()->default_value(0), "independent random numbers")(
         "scale", po::value<float>()->default_value(1.0f, "1"), "extinction = scale x density")(

@@ -245,7 +245,7 @@ TrkStatus trkGetVolumeInfo(const TrkVolume* handle, TrkVolumeInfo* info) {
         result.gridName = volume.grid.name.c_str();
         result.controlKind = "";
         result.storage = !volume.hasDensity() ? "" : volume.field->isHalf() ? "half" : "float";
-        result.kernel = trk::kernelName();
+        result.kernel = trk::kernelName(volume.options.kernel);
         if (volume.hasSuperVoxels()) {
             result.superVoxelSize = static_cast<uint32_t>(volume.superVoxels->size());
             result.superVoxelCount = volume.superVoxels->count();

@@ -2,6 +2,7 @@
 #include "api_structs.h"
 
 #include "failure.h"
+#include "kernel.h"
 #include "query/methods.h"
 
 #include <algorithm>
@@ -59,6 +60,22 @@ void checkThreads(int32_t threads) {
 
 }  // namespace
 
+Kernel kernelOf(const TrkVolumeOptions& options) {
+    if (!options.kernel) {
+        return kDefaultKernel;
+    }
+    const bool isAvx2 = std::strcmp(options.kernel, kernelName(Kernel::kAvx2)) == 0;
+    if (!isAvx2 && std::strcmp(options.kernel, kernelName(Kernel::kBaseline)) != 0) {
+        refuse(std::string("kernel is \"") + options.kernel +
+               "\"; expected \"baseline\" or \"avx2\"");
+    }
+    const Kernel kernel = isAvx2 ? Kernel::kAvx2 : Kernel::kBaseline;
+    if (!hasKernel(kernel)) {
+        refuse("kernel avx2: this processor or build has none; expected \"baseline\"");
+    }
+    return kernel;
+}
+
 TrkVolumeOptions checkedOptions(const TrkVolumeOptions* given) {
     const TrkVolumeOptions options =
         given ? completed(*given, "TrkVolumeOptions", kFirstVolumeOptions)
@@ -87,6 +104,7 @@ TrkVolumeOptions checkedOptions(const TrkVolumeOptions* given) {
     if (options.noBake > 1) {
         refuse("noBake is " + std::to_string(options.noBake) + "; expected 0 or 1");
     }
+    kernelOf(options);
     return options;
 }
 
@@ -102,6 +120,7 @@ VolumeOptions volumeOptions(const TrkVolumeOptions& options) {
     result.bakeMissing = options.noBake == 0;
     result.repair = options.repair;
     result.maxMemory = options.maxMemory;
+    result.kernel = kernelOf(options);
     return result;
 }
 

@@ -18,23 +18,34 @@
 
 namespace trk {
 
-inline bool chooseAvx2() {
+/// Whose code queries run.
+enum class Kernel { kBaseline, kAvx2 };
+
+inline const char* kernelName(Kernel kernel) {
+    return kernel == Kernel::kAvx2 ? "avx2" : "baseline";
+}
+
+/// Whether it was compiled, and the processor has it.
+inline bool hasKernel(Kernel kernel) {
 #ifdef TRACK_AVX2
     __builtin_cpu_init();
-    const char* wanted = std::getenv("TRACK_KERNEL");
-    return __builtin_cpu_supports("avx2") && __builtin_cpu_supports("fma") &&
-           !(wanted && std::strcmp(wanted, "baseline") == 0);
+    return kernel == Kernel::kBaseline ||
+           (__builtin_cpu_supports("avx2") && __builtin_cpu_supports("fma"));
 #else
-    return false;
+    return kernel == Kernel::kBaseline;
 #endif
 }
 
-/// Whether AVX2 kernels run: where they were compiled and the processor has it, unless the
-/// environment variable TRACK_KERNEL says "baseline". Decided when the library is loaded.
-inline const bool kUsesAvx2 = chooseAvx2();
-
-inline const char* kernelName() {
-    return kUsesAvx2 ? "avx2" : "baseline";
+inline Kernel chooseKernel() {
+    const char* wanted = std::getenv("TRACK_KERNEL");
+    return hasKernel(Kernel::kAvx2) &&
+                   !(wanted && std::strcmp(wanted, kernelName(Kernel::kBaseline)) == 0)
+               ? Kernel::kAvx2
+               : Kernel::kBaseline;
 }
+
+/// Of volumes that ask for none: the best there is, unless the environment variable TRACK_KERNEL
+/// says "baseline". Decided when the library is loaded.
+inline const Kernel kDefaultKernel = chooseKernel();
 
 }  // namespace trk

@@ -5,6 +5,7 @@
 #include "control/control_choice.h"
 #include "control/super_voxels.h"
 #include "field/density_field.h"
+#include "kernel.h"
 #include "space/geometry.h"
 
 #include <algorithm>
@@ -60,6 +61,7 @@ struct VolumeOptions {
     bool bakeMissing = false;  ///< where there is no sidecar, bake in memory
     uint32_t repair = 0;
     uint64_t maxMemory = 0;
+    Kernel kernel = kDefaultKernel;
 };
 
 struct Volume {
@@ -112,7 +114,8 @@ class VolumeExtinction {
   public:
     static constexpr size_t kChannels = C;
 
-    explicit VolumeExtinction(const Volume& volume) : field_(*volume.field) {
+    explicit VolumeExtinction(const Volume& volume)
+        : field_(*volume.field), kernel_(volume.options.kernel) {
         std::copy_n(volume.scales.begin(), C, scales_.begin());
     }
 
@@ -125,7 +128,7 @@ class VolumeExtinction {
     /// Over [t0, t1] of the ray, times the length of a voxel.
     std::array<double, C> integrate(const LocalRay& ray, double t0, double t1, uint64_t& lookups,
                                     uint64_t& regions) const {
-        return scaled(field_.integrate<F>(ray, t0, t1, lookups, regions));
+        return scaled(field_.integrate<F>(ray, t0, t1, kernel_, lookups, regions));
     }
     /// Calls `visit(t0, t1, depth)` for every cell and constant region on the way, until it answers
     /// false. `depth`: integral of the extinction, times the length of a voxel.
@@ -163,6 +166,7 @@ class VolumeExtinction {
     }
 
     const DensityField& field_;
+    Kernel kernel_;
     std::array<double, C> scales_;
 };
 

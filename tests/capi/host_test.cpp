@@ -163,7 +163,7 @@ TEST(Host, TheHeaderHasTheVersionOfTheLibrary) {
 
 // Padding would hold what happened to lie there, and a field of a later release could fall into it.
 TEST(Host, StructsAreFullOfFields) {
-    EXPECT_EQ(sizeof(TrkVolumeOptions), offsetof(TrkVolumeOptions, progressData) + sizeof(void*));
+    EXPECT_EQ(sizeof(TrkVolumeOptions), offsetof(TrkVolumeOptions, kernel) + sizeof(const char*));
     EXPECT_EQ(sizeof(TrkBakeOptions), offsetof(TrkBakeOptions, progressData) + sizeof(void*));
     EXPECT_EQ(sizeof(TrkDensity), offsetof(TrkDensity, tileActive) + sizeof(void*));
     EXPECT_EQ(sizeof(TrkQuery), offsetof(TrkQuery, resultStride) + sizeof(size_t));
@@ -173,6 +173,23 @@ TEST(Host, StructsAreFullOfFields) {
     options.noBake = 2;
     TrkVolume* volume = nullptr;
     EXPECT_EQ(trkOpenVolume("x.vdb", "", &options, &volume), TRK_ERROR_INVALID_ARGUMENT);
+}
+
+TEST(Host, AVolumeRunsTheKernelThatIsAskedFor) {
+    const std::string vdb = fixtures::cloudFile(64);
+    TrkVolumeOptions options = trkDefaultVolumeOptions();
+    options.kernel = "baseline";
+    const track::Volume baseline = track::Volume::open(vdb, nullptr, options);
+    EXPECT_STREQ(baseline.info().kernel, "baseline");
+    options.kernel = nullptr;
+    const track::Volume best = track::Volume::open(vdb, nullptr, options);
+    options.kernel = best.info().kernel;
+    EXPECT_STREQ(track::Volume::open(vdb, nullptr, options).info().kernel, best.info().kernel);
+    options.kernel = "AVX2";
+    TrkVolume* volume = nullptr;
+    EXPECT_EQ(trkOpenVolume(vdb.c_str(), nullptr, &options, &volume), TRK_ERROR_INVALID_ARGUMENT);
+    EXPECT_NE(std::string(trkGetLastErrorMessage()).find("kernel is \"AVX2\"; expected"),
+              std::string::npos);
 }
 
 TEST(Host, StructsTooSmallToBeAnyAreRefused) {

@@ -63,6 +63,8 @@ case_kernels() {
             TRACK_KERNEL=$kernel "$vdbtrack" query cloud.vdb --rays rays.csv --method $method >$kernel.csv ||
                 fail "query --method $method by the kernel $kernel"
         done
+        "$vdbtrack" query cloud.vdb --rays rays.csv --method $method --kernel baseline | cmp - baseline.csv ||
+            fail "--kernel and TRACK_KERNEL differ"
         paste -d, baseline.csv best.csv | awk -F, 'NR == 1 { next }
             { for (i = 1; i <= NF / 2; ++i) {
                   d = $i - $(i + NF / 2)
@@ -71,6 +73,8 @@ case_kernels() {
               ++rows }
             END { if (rows != 4) exit 1 }' || fail "kernels differ: $(paste -d, baseline.csv best.csv)"
     done
+    expect 1 query cloud.vdb --rays rays.csv --kernel sse
+    contains stderr 'kernel is "sse"; expected "baseline" or "avx2"'
 }
 
 case_help() {

@@ -164,6 +164,10 @@ typedef struct TrkVolumeOptions {
     uint64_t maxMemory; /**< refuse to hold more bytes than this; 0: no limit */
     TrkProgress progress; /**< or NULL */
     void* progressData;   /**< handed to it */
+    const char* kernel;   /**< whose code queries of the volume run: "avx2", or "baseline", which
+                             every processor has; NULL: the best of the processor, unless the
+                             environment variable TRACK_KERNEL says "baseline". Results have the
+                             same bits on one kernel, and differ in the last ones between two */
 } TrkVolumeOptions;
 
 static inline TrkVolumeOptions trkDefaultVolumeOptions(void) {
@@ -181,6 +185,7 @@ static inline TrkVolumeOptions trkDefaultVolumeOptions(void) {
     options.maxMemory = 0;
     options.progress = NULL;
     options.progressData = NULL;
+    options.kernel = NULL;
     return options;
 }
 
@@ -437,10 +442,7 @@ typedef struct TrkVolumeInfo {
     const char* gridName;     /**< of the source grid */
     const char* controlKind;  /**< "constant", "trilinear" or "affine"; "" without a sidecar */
     const char* storage;      /**< "float" or "half", "" where only a sidecar is open */
-    const char* kernel;       /**< whose code queries run: "avx2", or "baseline", which every
-                                   processor has and the environment variable TRACK_KERNEL may ask
-                                   for. Results have the same bits on one kernel, and differ in the
-                                   last ones between two */
+    const char* kernel;       /**< whose code queries run: see TrkVolumeOptions.kernel */
 } TrkVolumeInfo;
 
 /* ---- Volume ---------------------------------------------------------------------------------- */

@@ -76,21 +76,23 @@ TRACK_AVX2 std::array<double, C> integrateLineAvx2(const DensityField& field, co
 
 template <size_t C>
 std::array<double, C> DensityField::integrate(const LocalRay& ray, double t0, double t1,
-                                              uint64_t& lookups, uint64_t& regions) const {
+                                              Kernel kernel, uint64_t& lookups,
+                                              uint64_t& regions) const {
     const auto run = [&](const auto* bricks) {
 #ifdef TRACK_AVX2
-        if (kUsesAvx2) {
+        if (kernel == Kernel::kAvx2) {
             return integrateLineAvx2<C>(*this, bricks, ray, t0, t1, lookups, regions);
         }
 #endif
+        static_cast<void>(kernel);  // where there is but one
         return integrateLine<C>(*this, bricks, ray, t0, t1, lookups, regions);
     };
     return isHalf() ? run(halfs_.data()) : run(floats_.data());
 }
 
-template std::array<double, 1> DensityField::integrate<1>(const LocalRay&, double, double,
+template std::array<double, 1> DensityField::integrate<1>(const LocalRay&, double, double, Kernel,
                                                           uint64_t&, uint64_t&) const;
-template std::array<double, 3> DensityField::integrate<3>(const LocalRay&, double, double,
+template std::array<double, 3> DensityField::integrate<3>(const LocalRay&, double, double, Kernel,
                                                           uint64_t&, uint64_t&) const;
 
 }  // namespace trk

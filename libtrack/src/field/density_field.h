@@ -186,8 +186,8 @@ class DensityField {
     /// each cell: along a line a trilinear field is a cubic there, for which two Gauss points are
     /// exact. Adds two look-ups a cell to `lookups` and the bricks and tiles met to `regions`.
     template <size_t C>
-    std::array<double, C> integrate(const LocalRay& ray, double t0, double t1, uint64_t& lookups,
-                                    uint64_t& regions) const;
+    std::array<double, C> integrate(const LocalRay& ray, double t0, double t1, Kernel kernel,
+                                    uint64_t& lookups, uint64_t& regions) const;
 
     /// The same over the part of a ray in the region at `lo` that an entry stands for; adds the
     /// cells of a brick to `cells`.

@@ -370,7 +370,7 @@ void estimateTransmittance(const Volume& volume, const TrkQuery& query, const Tr
         const RayOutput<V> output(volume, query, transmittance, statistics);
         forEachRange(query, rayCount, [&](size_t begin, size_t end) {
 #ifdef TRACK_AVX2
-            if (kUsesAvx2) {
+            if (volume.options.kernel == Kernel::kAvx2) {
                 estimateRangeAvx2(volume, query, rays, begin, end, output);
                 return;
             }

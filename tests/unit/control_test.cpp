@@ -419,7 +419,9 @@ TEST(Control, BoundsOfConstantControlsCoverWhatLookUpsReturn) {
 TEST(Control, RobustKeepsWhatIsThinAndTakesTheMinimumOfWhatIsThick) {
     const auto share = [](TrkChoice choice, double min, double max, double excess,
                           double diagonal) {
-        return trk::ControlChoice{choice, diagonal}.share(min, max, excess);
+        double kept = 0;
+        trk::ControlChoice{choice, diagonal}.takeShare(min, max, excess, kept);
+        return kept;
     };
     // At most ln 2 collisions in which the control exceeds the extinction by all of the range.
     EXPECT_EQ(share(TRK_CHOICE_ROBUST, 0, 1, 0.8, 0.5), 1);

@@ -5,8 +5,6 @@
 #include "space/lanes.h"
 #include "track/track.h"
 
-#include <algorithm>
-
 namespace trk {
 
 /// Which control is taken out of a super-voxel. Everything here is extinction: the formula is not
@@ -58,13 +56,18 @@ struct ControlChoice {
 
     /// The share a of a control that is not constant which `choice` (robust or mean) keeps: the
     /// chosen control is min + a (control - min). `excess`: a bound of control - extinction.
-    double share(double min, double max, double excess) const {
-        if (choice == TRK_CHOICE_MEAN || !(max > min) || excess <= 0) {
-            return 1;
+    template <class Real>
+    void takeShare(const Real& min, const Real& max, const Real& excess, Real& share) const {
+        const Real one = Real{} + 1.0;
+        share = one;
+        if (choice == TRK_CHOICE_MEAN) {
+            return;
         }
-        double allowed = 0;
-        allowExcess(max - min, allowed);
-        return std::min(1.0, allowed / excess);
+        Real allowed;
+        allowExcess(Real(max - min), allowed);
+        share = max > min ? allowed / excess : one;
+        share = excess > 0 ? share : one;
+        takeLesser(one, share);
     }
 };
 

@@ -93,7 +93,17 @@ class SuperVoxelCursor {
           inverseSize_(powerOfTwo(-superVoxels.table_.itemShift())) {}
 
     /// The next few: how many; 0 at the end. The rest is about those from 0 on.
-    size_t refill() { return table_.refill(); }
+    size_t refill() {
+        const size_t count = table_.refill();
+        if constexpr (K != ControlKind::kConstant) {
+            lattice_ = table_.lattice();
+            for (size_t i = 0; i < count; ++i) {
+                __builtin_prefetch(&record(i, 0));
+                __builtin_prefetch(shape(i, 0).numbers);
+            }
+        }
+        return count;
+    }
     double tEnter(size_t i) const { return table_.tEnter(i); }
     double tExit(size_t i) const { return table_.tExit(i); }
     const SuperVoxel& record(size_t i, size_t channel) const {
@@ -105,13 +115,13 @@ class SuperVoxelCursor {
 
     /// What the baked control adds to its value at the centre, at a point of local space.
     double slopeAt(size_t i, size_t channel, const Vec3d& point) const {
-        return evaluateSlope<K>(shape(i, channel).slope(), toUnit(table_.lo(i), point));
+        return evaluateSlope<K>(shape(i, channel).slope(), toUnit(table_.lo(i, lattice_), point));
     }
     /// Integral of that over the ray's part in the super-voxel. An affine control is linear along a
     /// ray, a trilinear one cubic: one Gauss point is exact for the first, two for the second.
     double integrateSlope(size_t i, size_t channel, const LocalRay& ray) const {
         const float* coefficients = shape(i, channel).slope();
-        const Vec3d lo = table_.lo(i);
+        const Vec3d lo = table_.lo(i, lattice_);
         const double half = 0.5 * (tExit(i) - tEnter(i));
         const double middle = 0.5 * (tExit(i) + tEnter(i));
         if constexpr (K == ControlKind::kAffine) {
@@ -138,6 +148,7 @@ class SuperVoxelCursor {
 
     const SuperVoxels& superVoxels_;
     TableCursor table_;
+    Lattice lattice_;  // of what was found, where the control varies
     double inverseSize_;
 };
 

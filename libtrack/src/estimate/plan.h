@@ -109,28 +109,27 @@ class Plan {
 
     // Loops go by four stretches; those past the last one have no length.
 
-    /// What is baked of one channel of four of them.
-    struct Records {
-        Double4 min;
-        Double4 max;
-        Double4 mean;
-        Double4 deviation;
-    };
-    void load(size_t first, size_t c, Records& four) const {
+    /// Four numbers of each of them, as vectors of the first, the second and so on.
+    /// `numbersOf(i)`: where those of a stretch are.
+    template <class NumbersOf>
+    void load(size_t first, const NumbersOf& numbersOf, Double4 (&four)[4]) const {
         Float4 v[4];
         for (size_t k = 0; k < 4; ++k) {
-            const SuperVoxel& record = cursor_.record(std::min(first + k, count_ - 1), c);
-            std::memcpy(&v[k], &record, sizeof(v[k]));
+            std::memcpy(&v[k], numbersOf(std::min(first + k, count_ - 1)), sizeof(v[k]));
         }
         const Float4 ab = __builtin_shufflevector(v[0], v[1], 0, 4, 1, 5);
         const Float4 cd = __builtin_shufflevector(v[2], v[3], 0, 4, 1, 5);
         const Float4 ef = __builtin_shufflevector(v[0], v[1], 2, 6, 3, 7);
         const Float4 gh = __builtin_shufflevector(v[2], v[3], 2, 6, 3, 7);
-        four.min = __builtin_convertvector(__builtin_shufflevector(ab, cd, 0, 1, 4, 5), Double4);
-        four.max = __builtin_convertvector(__builtin_shufflevector(ab, cd, 2, 3, 6, 7), Double4);
-        four.mean = __builtin_convertvector(__builtin_shufflevector(ef, gh, 0, 1, 4, 5), Double4);
-        four.deviation =
-            __builtin_convertvector(__builtin_shufflevector(ef, gh, 2, 3, 6, 7), Double4);
+        four[0] = __builtin_convertvector(__builtin_shufflevector(ab, cd, 0, 1, 4, 5), Double4);
+        four[1] = __builtin_convertvector(__builtin_shufflevector(ab, cd, 2, 3, 6, 7), Double4);
+        four[2] = __builtin_convertvector(__builtin_shufflevector(ef, gh, 0, 1, 4, 5), Double4);
+        four[3] = __builtin_convertvector(__builtin_shufflevector(ef, gh, 2, 3, 6, 7), Double4);
+    }
+    static void takeRoot(Double4& squares) {
+        for (int k = 0; k < 4; ++k) {
+            squares[k] = std::sqrt(squares[k]);
+        }
     }
 
     /// One channel: its control, and what that leaves.
@@ -140,13 +139,21 @@ class Plan {
         const bool wantsRms = settings_.rateBase == RateBase::kRms;
         const double unit = settings_.rate * settings_.lengthPerVoxel;
         for (size_t i = 0; i < count_; i += 4) {
-            Records four;
-            load(i, c, four);
-            const Double4 min = scale * four.min;
-            const Double4 max = scale * four.max;
-            const Double4 mean = scale * four.mean;
+            Double4 baked[4];  // a SuperVoxel's
+            SuperVoxel records[4];
+            for (size_t k = 0; k < 4; ++k) {
+                records[k] = cursor_.record(std::min(i + k, count_ - 1), c);
+            }
+            load(
+                0, [&](size_t k) { return &records[k]; }, baked);
+            const Double4 min = scale * baked[0];
+            const Double4 max = scale * baked[1];
+            const Double4 mean = scale * baked[2];
+            const Double4 deviation = scale * baked[3];
             Double4 control;
-            if constexpr (kControl == Control::kChosen) {
+            if constexpr (kVaries) {
+                control = min;
+            } else if constexpr (kControl == Control::kChosen) {
                 choice.takeConstant(min, mean, max, control);
             } else if constexpr (kControl == Control::kMinimum) {
                 control = min;
@@ -155,52 +162,42 @@ class Plan {
             }
             Double4 bound = control - min;
             takeGreater(Double4(max - control), bound);
+            Double4 rms{};  // of what is left
+            if (wantsRms) {
+                rms = deviation * deviation + (control - mean) * (control - mean);
+                takeRoot(rms);
+            }
+            if constexpr (kVaries) {
+                // What is left is share (extinction - baked control) + (1 - share) (extinction -
+                // min), of which the second has been said already.
+                Double4 shape[4];  // a ControlShape's head
+                load(
+                    i, [&](size_t k) { return cursor_.shape(k, c).numbers; }, shape);
+                const Double4 centre = scale * shape[0];
+                const Double4 majorant = scale * shape[2];
+                Double4 excess = scale * shape[1] - min;
+                takeLesser(majorant, excess);
+                Double4 share;
+                choice.takeShare(min, max, excess, share);
+                control = min + share * (centre - min);
+                bound = share * majorant + (1 - share) * bound;
+                rms = share * scale * shape[3] + (1 - share) * rms;
+                store(share * scale, slope_[c] + i);
+            }
             store(min, min_[c] + i);
             store(max, max_[c] + i);
             store(control, control_[c] + i);
             store(bound, bound_[c] + i);
-            Double4 squared{};  // the mean of what is left
-            if (wantsRms) {
-                const Double4 deviation = scale * four.deviation;
-                squared = deviation * deviation + (control - mean) * (control - mean);
-            }
-            if constexpr (kVaries) {
-                for (size_t k = 0; k < 4 && i + k < count_; ++k) {
-                    squared[k] = vary(i + k, c, scale * four.deviation[k], mean[k]);
-                }
-                trk::load(bound_[c] + i, bound);
-            }
             Double4 base = bound;
             if (wantsRms) {
                 base = kLeastRate * bound;
-                Double4 root{};
-                for (size_t k = 0; k < 4; ++k) {
-                    root[k] = std::sqrt(squared[k]);
-                }
-                takeGreater(root, base);
+                takeGreater(rms, base);
             }
             Double4 rate;
             trk::load(rate_ + i, rate);
             takeGreater(Double4(unit * base), rate);
             store(rate, rate_ + i);
         }
-    }
-
-    /// The same of one stretch where the control is not constant; the mean square of what is left.
-    double vary(size_t i, size_t c, double deviation, double mean) {
-        const ControlShape shape = cursor_.shape(i, c);
-        const double scale = superVoxels_.scale(c);
-        const double min = min_[c][i];
-        const double majorant = scale * shape.majorant();
-        const double excess = std::min(majorant, scale * shape.max() - min);
-        const double share = superVoxels_.choice().share(min, max_[c][i], excess);
-        control_[c][i] = min + share * (scale * shape.centre() - min);
-        slope_[c][i] = share * scale;
-        // What is left is share (extinction - baked control) + (1 - share) (extinction - min).
-        bound_[c][i] = share * majorant + (1 - share) * (max_[c][i] - min);
-        const double root =
-            share * scale * shape.rms() + (1 - share) * std::hypot(deviation, mean - min);
-        return root * root;
     }
 
     /// How each is treated.

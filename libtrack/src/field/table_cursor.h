@@ -77,9 +77,10 @@ class TableCursor {
     Entry entry(size_t i) const { return entries_[i]; }
     double tEnter(size_t i) const { return window_.time[cells_[i]]; }
     double tExit(size_t i) const { return window_.time[cells_[i] + size_t{1}]; }
-    /// The lower corner.
-    Vec3d lo(size_t i) const {
-        const Lattice lattice = table_.lattice(depth_);
+    /// Of what was found.
+    Lattice lattice() const { return table_.lattice(depth_); }
+    /// The lower corner. `lattice`: as above.
+    Vec3d lo(size_t i, const Lattice& lattice) const {
         Vec3d corner;
         for (size_t a = 0; a < 3; ++a) {
             corner[static_cast<int>(a)] =
@@ -87,6 +88,7 @@ class TableCursor {
         }
         return corner;
     }
+    Vec3d lo(size_t i) const { return lo(i, lattice()); }
 
   private:
     /// Of items of one voxel in the largest box.

@@ -96,7 +96,9 @@ SuperVoxels::SuperVoxels(BakedVolume baked)
                                                       rounding + kLookupRounding * largest));
         shapes_.push_back(isHomogeneous ? 0 : item.rms);
         for (size_t k = 0; k < slopes; ++k) {
-            shapes_.push_back(isHomogeneous ? 0 : static_cast<float>(control.slope[k]));
+            shapes_.push_back(
+                isHomogeneous ? 0
+                              : static_cast<float>(control.slope[k] / ControlShape::kSlopeUnit));
         }
     }
     boxes_.assign(1, table_.occupiedBox());

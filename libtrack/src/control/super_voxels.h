@@ -26,9 +26,11 @@ struct SuperVoxel {
 };
 
 /// One channel of a control that is not constant: kHead numbers, then the coefficients of
-/// control_shape.h.
+/// control_shape.h in units of kSlopeUnit: those of a trilinear control may be four times as large
+/// as a float where the density is as large as one.
 struct ControlShape {
     static constexpr size_t kHead = 4;
+    static constexpr double kSlopeUnit = 4;
     const float* numbers;
 
     double centre() const { return static_cast<double>(numbers[0]); }
@@ -95,7 +97,7 @@ class SuperVoxelCursor {
     /// The next few: how many; 0 at the end. The rest is about those from 0 on.
     size_t refill() {
         const size_t count = table_.refill();
-        if constexpr (K != ControlKind::kConstant) {
+        if (K != ControlKind::kConstant && count > 0) {
             lattice_ = table_.lattice();
             for (size_t i = 0; i < count; ++i) {
                 __builtin_prefetch(&record(i, 0));
@@ -115,19 +117,21 @@ class SuperVoxelCursor {
 
     /// What the baked control adds to its value at the centre, at a point of local space.
     double slopeAt(size_t i, size_t channel, const Vec3d& point) const {
-        return evaluateSlope<K>(shape(i, channel).slope(), toUnit(table_.lo(i, lattice_), point));
+        return ControlShape::kSlopeUnit *
+               evaluateSlope<K>(shape(i, channel).slope(), toUnit(table_.lo(i, lattice_), point));
     }
     /// Integral of that over the ray's part in the super-voxel. An affine control is linear along a
     /// ray, a trilinear one cubic: one Gauss point is exact for the first, two for the second.
     double integrateSlope(size_t i, size_t channel, const LocalRay& ray) const {
         const float* coefficients = shape(i, channel).slope();
         const Vec3d lo = table_.lo(i, lattice_);
-        const double half = 0.5 * (tExit(i) - tEnter(i));
+        const double half = ControlShape::kSlopeUnit * 0.5 * (tExit(i) - tEnter(i));
         const double middle = 0.5 * (tExit(i) + tEnter(i));
         if constexpr (K == ControlKind::kAffine) {
             return 2 * half * evaluateSlope<K>(coefficients, toUnit(lo, ray.at(middle)));
         } else {
-            const double offset = half * 0.57735026918962576451;  // 1/sqrt(3)
+            const double offset =
+                half / ControlShape::kSlopeUnit * 0.57735026918962576451;  // 1/sqrt(3)
             return half * (evaluateSlope<K>(coefficients, toUnit(lo, ray.at(middle - offset))) +
                            evaluateSlope<K>(coefficients, toUnit(lo, ray.at(middle + offset))));
         }

@@ -62,10 +62,9 @@ struct OneChannelWalk {
     const ControlChoice& choice() const { return superVoxels.choice(); }
     using Whole = decltype(std::declval<const SuperVoxels&>().cursor(
         std::declval<const LocalRay&>(), 0.0, 0.0));
-    struct Cursor : Whole {
-        Cursor(const Whole& whole, size_t only) : Whole(whole), channel(only) {}
-        const SuperVoxel& record(size_t i, size_t) const { return Whole::record(i, channel); }
+    struct Cursor : Whole {  // an aggregate: what it is made of is made in place
         size_t channel;
+        const SuperVoxel& record(size_t i, size_t) const { return Whole::record(i, channel); }
     };
     Cursor cursor(const LocalRay& ray, double t0, double t1) const {
         return {superVoxels.cursor(ray, t0, t1), channel};

@@ -223,7 +223,8 @@ class Plan {
     /// and 2 extinction - (extinction - control)^2 / rate where it is tracked: concave in the
     /// extinction, so least at one of its bounds. With D = the least integral of f, less that of
     /// the extinction's minimum, the second moment is at most threshold W exp(-integral of the
-    /// minimum): the threshold, times the largest transmittance that the bounds allow.
+    /// minimum): the threshold, times the largest transmittance that the bounds allow. That is said
+    /// of what this plan has crossed; and where D is negative, 0 is counted on.
     void lookAhead(size_t c) {
         const double unit = settings_.lengthPerVoxel;
         double least[kMost];
@@ -253,7 +254,6 @@ class Plan {
                 depth = min - below * below * inverse;
                 takeLesser(Double4(2 * max - above * above * inverse - min), depth);
             }
-            takeGreater(Double4{}, depth);
             Double4 tracked;
             trk::load(tracked_ + i, tracked);
             depth = tracked == kInfinity ? min : depth;
@@ -267,7 +267,7 @@ class Plan {
         double sum = 0;
         for (size_t i = count_; i-- > 0;) {
             sum += least[i];
-            ahead_[c][i] = sum;
+            ahead_[c][i] = std::max(sum, 0.0);
         }
     }
 

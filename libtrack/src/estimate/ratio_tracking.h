@@ -44,10 +44,8 @@ class Throughput {
     }
     const std::array<double, C>& opticalDepth() const { return opticalDepth_; }
     void setOpticalDepth(const std::array<double, C>& depth) { opticalDepth_ = depth; }
-    /// Whether any product is large enough for roulette to leave it alone, by what is known without
-    /// an exponential.
-    bool matters() const { return matters(opticalDepth_); }
-    /// The same, were this the optical depth.
+    /// Whether any product is large enough for roulette to leave it alone, were this the optical
+    /// depth: by what is known without an exponential.
     bool matters(const std::array<double, C>& depth) const {
         bool any = false;
         for (size_t c = 0; c < C; ++c) {
@@ -55,12 +53,8 @@ class Throughput {
         }
         return any;
     }
-    /// Whether the walk goes on. Sets `isRandom` where that was left to chance.
-    template <class Random>
-    bool survives(Random& random, bool& isRandom) {
-        return survives(opticalDepth_, random, isRandom);
-    }
-    /// The same, were this the optical depth.
+    /// Whether the walk goes on, were this the optical depth. Sets `isRandom` where that was left
+    /// to chance.
     template <class Random>
     bool survives(const std::array<double, C>& depth, Random& random, bool& isRandom) {
         if (matters(depth)) {
@@ -153,9 +147,10 @@ class RatioWalk {
         }
         // What is left of the stretch that the walk is in does not count, nor does its control: it
         // may still be needed to outweigh collisions that amplify.
-        return settings_.roulette
-                   ? sofar_.survives(depthAhead(at_ + (isInside_ ? 1 : 0)), random_, cost_.random)
-                   : !sofar_.isZero();
+        if (!settings_.roulette) {
+            return !sofar_.isZero();
+        }
+        return sofar_.survives(depthAhead(at_ + (isInside_ ? 1 : 0)), random_, cost_.random);
     }
 
     std::array<double, C> result() const {
@@ -192,7 +187,7 @@ class RatioWalk {
             pass();
             if (at_ == plan_.count()) {
                 // As long as all was homogeneous, walks do not end.
-                if (settings_.roulette && cost_.random && !goesOn(at_)) {
+                if (settings_.roulette && isRandom_ && !goesOn(at_)) {
                     return false;
                 }
                 at_ = 0;
@@ -208,7 +203,7 @@ class RatioWalk {
             ++cost_.superVoxels;
             if (!plan_.isExact(at_)) {
                 remaining_ = plan_.collisions(at_);
-                cost_.random = true;
+                cost_.random = isRandom_ = true;
                 isInside_ = true;
                 return true;
             }
@@ -235,16 +230,19 @@ class RatioWalk {
         double distance = distance_;
         std::array<double, C> depth = sofar_.opticalDepth();
         const size_t count = plan_.count();
+        double passed = 0;  // which may be too little to change the distance
         size_t i = at_;
         while (i < count && distance >= plan_.collisionsToTrack(i)) {
             distance -= plan_.collisionsToTrack(i);
+            passed += plan_.collisionsToTrack(i);
             for (size_t c = 0; c < C; ++c) {
                 depth[c] += plan_.depth(i, c);
             }
             ++i;
         }
         cost_.superVoxels += i - at_;
-        cost_.random = cost_.random || distance < distance_;
+        isRandom_ = isRandom_ || passed > 0;
+        cost_.random = cost_.random || isRandom_;
         at_ = i;
         distance_ = distance;
         sofar_.setOpticalDepth(depth);
@@ -284,6 +282,7 @@ class RatioWalk {
     Plan<kControl, SuperVoxels> plan_;
     size_t at_ = 0;  // of its stretches
     Throughput<C> sofar_;
+    bool isRandom_ = false;  // another walk might have had another result, roulette apart
     bool isInside_ = false;  // a stretch, not done with its collisions
     bool isDone_ = false;    // nor is there another one
     double remaining_ = 0;   // optical distances: to its end

@@ -374,6 +374,24 @@ TEST(Api, StatisticsTellWhatWasSpent) {
     EXPECT_GT(error, 0);
 }
 
+// Depths of 1e-22 change no random distance, and yet another sample might have collided.
+TEST(Api, TheThinnestDensitiesHaveNoErrorThatIsKnown) {
+    const track::Volume volume = openCloud(1e-24f);
+    const std::vector<TrkRay> all = cloudRays(volume, 100);
+    std::vector<float> out(all.size());
+    track::Statistics statistics(all.size(), 1);
+    for (const TrkMethod method : {TRK_METHOD_RATIO, TRK_METHOD_RESIDUAL, TRK_METHOD_DELTA}) {
+        track::Query query(0, 0);
+        query.method = method;
+        query.samples = 4;
+        volume.estimateTransmittance(query, all.data(), all.size(), out.data(), statistics.view());
+        for (size_t i = 0; i < all.size(); ++i) {
+            EXPECT_EQ(out[i], 1);
+            EXPECT_EQ(std::isnan(statistics.standardError[i]), statistics.superVoxels[i] > 0) << i;
+        }
+    }
+}
+
 TEST(Api, ConcurrentQueriesAgree) {
     const track::Volume volume = openCloud();
     const std::vector<TrkRay> all = cloudRays(volume, 2000);

@@ -195,6 +195,44 @@ TEST(SuperVoxels, BoundsCoverTheResidualOfEveryChoice) {
     }
 }
 
+// Coefficients of a trilinear control may be four times as large as its values.
+TEST(SuperVoxels, ControlsOfTheLargestDensitiesAreFinite) {
+    constexpr float kLarge = 3e38f;
+    trk::BakedVolume baked;
+    baked.kind = trk::ControlKind::kTrilinear;
+    baked.table = trk::TableBuilder(4, {{{0, 0, 0}}, {{16, 16, 16}}})
+                      .fill(
+                          {}, [](const trk::Int3&, int) { return std::nullopt; },
+                          [](const trk::Int3&) { return 1u | trk::SparseTable::kSingleFlag; });
+    baked.items.push_back({0, kLarge, kLarge / 2, kLarge / 2, kLarge, kLarge / 2});
+    for (int corner = 0; corner < 8; ++corner) {
+        baked.shapes.push_back((corner >> 2 ^ corner >> 1 ^ corner) & 1 ? kLarge : 0);
+    }
+    trk::Volume volume;
+    volume.scales = {0.1};
+    volume.superVoxels = std::make_shared<const trk::SuperVoxels>(std::move(baked));
+    volume.controlChoice = {TRK_CHOICE_MEAN, 1};
+    trk::LocalRay ray;
+    ray.origin = {{0, 0.5, 0.5}};
+    ray.direction[0] = 1;
+    ray.inverse = {{1, 1e300, 1e300}};
+    ray.tEnd = 16;
+    int met = 0;
+    trk::forEachStretch<trk::Control::kChosen>(
+        trk::Variant<1, 1, trk::ControlKind::kTrilinear>::Walk(volume), ray, {},
+        [&](const auto& plan, size_t i) {
+            ++met;
+            for (int corner = 0; corner < 8; ++corner) {
+                const double control = plan.control(
+                    i, 0, {{corner & 4 ? 16.0 : 0, corner & 2 ? 16.0 : 0, corner & 1 ? 16.0 : 0}});
+                const bool large = (corner >> 2 ^ corner >> 1 ^ corner) & 1;
+                EXPECT_NEAR(control, large ? 0.1 * static_cast<double>(kLarge) : 0, 1e32);
+            }
+            EXPECT_TRUE(std::isfinite(plan.depth(i, 0)));
+        });
+    EXPECT_EQ(met, 1);
+}
+
 TEST(AffineMap, InverseUndoesExtremeMaps) {
     for (const double voxel : {1e-120, 1e-9, 1.0, 1e9}) {
         trk::AffineMap map;

@@ -121,12 +121,11 @@ Estimate<V::kChannels> estimateRandomly(const Volume& volume, const TrkQuery& qu
     const TrackingSettings settings = trackingSettings(query, clipped.lengthPerVoxel);
     const LocalRay& ray = clipped.local;
     const typename V::Extinction extinction(volume);
-    const typename V::Walk superVoxels(volume);
     SampleMean<V::kChannels> mean;
     for (uint32_t i = 0; i < query.samples; ++i) {
         Rng rng(query.seed, query.stream, rayId, i);
         if (query.method == TRK_METHOD_DELTA) {
-            mean.add(trackBinary(extinction, superVoxels, ray, settings, rng, cost));
+            mean.add(trackBinary(extinction, typename V::Walk(volume), ray, settings, rng, cost));
             continue;
         }
         auto depth = marchOpticalDepth(extinction, ray, settings.lengthPerVoxel,

@@ -4,10 +4,10 @@ set -euo pipefail
 
 packages=(g++ cmake ninja-build libopenvdb-dev libtbb-dev libboost-iostreams-dev
           libboost-program-options-dev libopenexr-dev libimath-dev libpng-dev nlohmann-json3-dev
-          zlib1g-dev libblosc-dev gnuplot-nox)
+          zlib1g-dev libblosc-dev)
 if [ "${1:-}" = test ]; then
     packages+=(libgtest-dev libbenchmark-dev clang-format ccache git libopenvdb-tools libnanovdb-dev
-               clang libclang-rt-dev)
+               clang libclang-rt-dev nodejs)
 fi
 
 missing=()

@@ -6,7 +6,6 @@
 #include "io/density.h"
 #include "io/output_file.h"
 #include "names.h"
-#include "report/plot.h"
 #include "report/report.h"
 
 #include <algorithm>
@@ -227,7 +226,6 @@ void run(const Command& command, const std::vector<std::string>& given) {
     Report report;
     report.options = sweepOptionsOf(arguments);
     const std::optional<ScatterOptions> scatter = scatterOptionsOf(arguments);
-    requireGnuplot();
 
     const auto start = std::chrono::steady_clock::now();
     {
@@ -288,7 +286,7 @@ void run(const Command& command, const std::vector<std::string>& given) {
     report.seconds =
         std::chrono::duration<double>(std::chrono::steady_clock::now() - start).count();
     write(csv, csvOf(report));
-    write(json, jsonOf(report));
+    write(json, textOf(jsonOf(report), 1) + "\n");
     write(html, htmlOf(report));
     csv.commit();
     json.commit();

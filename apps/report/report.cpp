@@ -24,14 +24,15 @@ double scoreOf(const SweepRow& row, const vdbtools::Accuracy& accuracy) {
     return row.converged ? row.score(accuracy.elsewhere) : std::nan("");
 }
 
+/// Not finite is null: in JSON there is no other way, and a CSV's field is then empty.
+ordered_json number(double value) {
+    return std::isfinite(value) ? ordered_json(value) : ordered_json(nullptr);
+}
+
 /// Named numbers and texts of a row, in the order of the CSV's columns: one list for both files.
 ordered_json fieldsOf(const Report& report, const SweepRow& row) {
     const SweepSet& set = report.sweep.sets[row.set];
     const Way& way = row.way;
-    // Not finite is null: in JSON there is no other way, and a CSV's field is then empty.
-    const auto number = [](double value) {
-        return std::isfinite(value) ? ordered_json(value) : ordered_json(nullptr);
-    };
     ordered_json fields;
     fields["rays"] = set.rays == vdbtools::RayKind::kCamera ? "camera" : "secondary";
     fields["coloured"] = set.coloured;
@@ -95,6 +96,7 @@ ordered_json scatteringJson(const Scattering& scattering) {
     json["control"] = scattering.options.control;
     json["scale"] = scattering.options.scale;
     json["color"] = scattering.options.color;
+    json["delta_samples"] = scattering.options.samples;
     json["reference_samples"] = scattering.referenceSamples;
     for (const ScatterMethod& m : scattering.methods) {
         ordered_json method;
@@ -113,6 +115,56 @@ ordered_json scatteringJson(const Scattering& scattering) {
         json["methods"].push_back(method);
     }
     return json;
+}
+
+ordered_json stripJson(const vdbtools::Strip& strip) {
+    ordered_json json;
+    json["size"] = strip.whole ? ordered_json("all") : ordered_json(strip.size);
+    for (const vdbtools::StripRow& row : strip.rows) {
+        double mean = 0;
+        for (const float v : row.variance) {
+            mean += static_cast<double>(v) / static_cast<double>(row.variance.size());
+        }
+        json["rows"].push_back({{"choice", vdbtools::kChoiceNames[static_cast<size_t>(row.choice)]},
+                                {"variance", number(mean)}});
+    }
+    return json;
+}
+
+ordered_json setJson(const Report& report, size_t s) {
+    const SweepSet& set = report.sweep.sets[s];
+    ordered_json json;
+    json["rays"] = set.rays == vdbtools::RayKind::kCamera ? "camera" : "secondary";
+    json["coloured"] = set.coloured;
+    json["depth"] = set.depth > 0 ? ordered_json(set.depth) : ordered_json("own");
+    json["scale"] = set.scale;
+    json["ray_count"] = set.rayCount;
+    json["mean_depth"] = set.meanDepth;
+    json["mean_transmittance"] = set.meanTransmittance;
+    json["rows"] = ordered_json::array();
+    const std::vector<const SweepRow*> front = vdbtools::paretoFront(report.sweep, s);
+    for (const SweepRow& row : report.sweep.rows) {
+        if (row.set == s) {
+            ordered_json fields = fieldsOf(report, row);
+            for (const char* key : {"rays", "coloured", "depth"}) {
+                fields.erase(key);  // the set's
+            }
+            fields["way"] = vdbtools::nameOf(row.way);
+            fields["unbiased"] = row.way.isUnbiased();
+            fields["front"] = std::find(front.begin(), front.end(), &row) != front.end();
+            json["rows"].push_back(fields);
+        }
+    }
+    return json;
+}
+
+/// Why there is no advice.
+std::string reasonForNoAdvice(const Report& report) {
+    const std::vector<Way>& ways = report.options.ways;
+    return std::any_of(ways.begin(), ways.end(), [](const Way& w) { return w.isUnbiased(); })
+               ? "No way converged on all sets of rays: measure fewer depths, or more rounds or "
+                 "rays."
+               : "There is nothing to recommend: every method that was measured is biased.";
 }
 
 }  // namespace
@@ -141,13 +193,19 @@ std::string csvOf(const Report& report) {
     return out.str();
 }
 
-std::string jsonOf(const Report& report) {
+ordered_json jsonOf(const Report& report) {
     ordered_json json;
     json["tool_version"] = TRACK_VERSION;
     json["input"] = report.input;
     json["grid"] = report.source.summary.grid.name;
     json["command"] = report.command;
+    json["bake_command"] = report.bakeHead;
     json["active_voxels"] = report.source.summary.activeVoxels;
+    json["box"] = ordered_json::array();
+    const trk::IntBox& box = report.source.field->box();
+    for (int axis = 0; axis < 3; ++axis) {
+        json["box"].push_back(box.hi[axis] - box.lo[axis]);
+    }
     json["seconds"] = report.seconds;
     json["rounds"] = report.options.rounds;
     json["seed"] = report.options.seed;
@@ -155,26 +213,7 @@ std::string jsonOf(const Report& report) {
     json["z_bound"] = report.sweep.zBound;
     json["sets"] = ordered_json::array();
     for (size_t s = 0; s < report.sweep.sets.size(); ++s) {
-        const SweepSet& set = report.sweep.sets[s];
-        ordered_json item;
-        item["rays"] = set.rays == vdbtools::RayKind::kCamera ? "camera" : "secondary";
-        item["coloured"] = set.coloured;
-        item["depth"] = set.depth > 0 ? ordered_json(set.depth) : ordered_json("own");
-        item["scale"] = set.scale;
-        item["ray_count"] = set.rayCount;
-        item["mean_depth"] = set.meanDepth;
-        item["mean_transmittance"] = set.meanTransmittance;
-        item["rows"] = ordered_json::array();
-        for (const SweepRow& row : report.sweep.rows) {
-            if (row.set == s) {
-                ordered_json fields = fieldsOf(report, row);
-                for (const char* key : {"rays", "coloured", "depth"}) {
-                    fields.erase(key);  // the set's
-                }
-                item["rows"].push_back(fields);
-            }
-        }
-        json["sets"].push_back(item);
+        json["sets"].push_back(setJson(report, s));
     }
     json["bakes"] = ordered_json::array();
     for (const vdbtools::SweepBake& bake : report.sweep.bakes) {
@@ -183,33 +222,35 @@ std::string jsonOf(const Report& report) {
                                  {"seconds", bake.seconds},
                                  {"super_voxels", bake.superVoxels},
                                  {"sidecar_bytes", bake.sidecarBytes},
-                                 {"residual_share", bake.residualShare}});
+                                 {"residual_share", number(bake.residualShare)}});
     }
     json["recommendation"] = ordered_json::array();
     for (const vdbtools::Advice& advice : report.advice) {
         json["recommendation"].push_back({{"accuracy", advice.accuracy.name},
+                                          {"way", vdbtools::nameOf(advice.choice.way)},
                                           {"variance_elsewhere", advice.accuracy.elsewhere},
                                           {"bake", advice.bake},
                                           {"query", advice.query},
                                           {"cost_over_best", advice.choice.cost},
                                           {"why", advice.why}});
     }
+    if (report.advice.empty()) {
+        json["no_recommendation"] = reasonForNoAdvice(report);
+    }
+    json["strip_depth"] = report.stripDepth;
+    json["strips"] = ordered_json::array();
+    for (const vdbtools::Strip& strip : report.strips) {
+        json["strips"].push_back(stripJson(strip));
+    }
     if (report.scattering) {
         json["dual_scattering"] = scatteringJson(*report.scattering);
     }
-    // Names of files may be any bytes.
-    return json.dump(1, ' ', false, ordered_json::error_handler_t::replace) + "\n";
+    return json;
 }
 
-std::string reasonForNoAdvice(const Report& report) {
-    if (!report.advice.empty()) {
-        return "";
-    }
-    const std::vector<Way>& ways = report.options.ways;
-    return std::any_of(ways.begin(), ways.end(), [](const Way& w) { return w.isUnbiased(); })
-               ? "No way converged on all sets of rays: measure fewer depths, or more rounds or "
-                 "rays."
-               : "There is nothing to recommend: every method that was measured is biased.";
+std::string textOf(const ordered_json& json, int indent) {
+    // Names of files may be any bytes.
+    return json.dump(indent, ' ', false, ordered_json::error_handler_t::replace);
 }
 
 std::string adviceText(const Report& report) {

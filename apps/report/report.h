@@ -8,6 +8,8 @@
 #include "measure/sweep.h"
 #include "path_tracer.h"
 
+#include <nlohmann/json.hpp>
+
 #include <optional>
 #include <string>
 #include <vector>
@@ -31,12 +33,11 @@ struct Report {
 
 /// One line a measured row.
 std::string csvOf(const Report& report);
-std::string jsonOf(const Report& report);
-/// A page without any other file: plots as SVG, pictures inside.
+nlohmann::ordered_json jsonOf(const Report& report);
+/// UTF-8, indented by so many spaces; -1: on one line.
+std::string textOf(const nlohmann::ordered_json& json, int indent);
+/// A page without any other file: it holds the JSON, pictures, and a script that draws them.
 std::string htmlOf(const Report& report);
-
-/// Why there is no advice; empty where there is some.
-std::string reasonForNoAdvice(const Report& report);
 
 /// The advice for a terminal, or why there is none.
 std::string adviceText(const Report& report);

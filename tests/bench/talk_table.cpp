@@ -25,6 +25,7 @@ using analytic::Everywhere;
 using analytic::measure;
 using analytic::Measured;
 using analytic::Ramp;
+using analytic::trackBinary;
 using vdbtools::SweepRow;
 using vdbtools::Way;
 
@@ -49,7 +50,7 @@ struct Slab {
     }
     Measured delta() const {
         return measure(kSamples, [&](trk::Rng& rng, trk::PathCost& cost) {
-            return trk::trackBinary(medium, super, medium.ray(), plainSettings(), rng, cost)[0];
+            return trackBinary(medium, super, medium.ray(), plainSettings(), rng, cost)[0];
         });
     }
     template <trk::Control kControl>

@@ -4,6 +4,7 @@
 
 #include "control/control_choice.h"
 #include "control/super_voxels.h"
+#include "estimate/free_path.h"
 #include "estimate/rng.h"
 #include "estimate/tracking.h"
 
@@ -103,6 +104,24 @@ Measured measure(uint64_t samples, const Estimate& estimate) {
     }
     const auto n = static_cast<double>(samples);
     return {sum / n, squares / n - sum / n * (sum / n), static_cast<double>(cost.lookups) / n};
+}
+
+/// One estimate by delta tracking, with random numbers that go on.
+template <class Field, class SuperVoxels>
+std::array<double, Field::kChannels> trackBinary(const Field& field, const SuperVoxels& superVoxels,
+                                                 const LocalRay& ray,
+                                                 const trk::TrackingSettings& settings,
+                                                 trk::Rng& rng, trk::PathCost& cost) {
+    struct Random {
+        trk::Rng& rng;
+        double uniform() { return rng.uniform(); }
+        double exponential() { return rng.exponential(); }
+    };
+    std::array<double, Field::kChannels> result{};
+    trk::trackBinary(
+        field, superVoxels, ray, settings, 1, [&](uint32_t) { return Random{rng}; }, cost,
+        [&](const auto& passes) { result = passes; });
+    return result;
 }
 
 }  // namespace analytic

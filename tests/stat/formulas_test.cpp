@@ -29,6 +29,7 @@ using analytic::Everywhere;
 using analytic::measure;
 using analytic::Measured;
 using analytic::Ramp;
+using analytic::trackBinary;
 using trk::LocalRay;
 
 void expectFormula(const char* what, const Measured& found, double transmittance,
@@ -101,7 +102,7 @@ void expectFormulas(const std::string& name, const Ramp& medium, double min, dou
     for (const double multiplier : {1.0, 2.0}) {
         settings.rate = multiplier;
         const Measured delta = measure(kSamples, [&](trk::Rng& rng, trk::PathCost& cost) {
-            return trk::trackBinary(medium, super, ray, settings, rng, cost)[0];
+            return trackBinary(medium, super, ray, settings, rng, cost)[0];
         });
         // Tentative collisions up to the real one: the integral of rate x T.
         const double rate = multiplier * max;
@@ -155,7 +156,7 @@ TEST(Formulas, RatioOverDeltaIsThePredictedOne) {
                                                                 settings, rng, cost)[0];
         });
         const Measured delta = measure(kSamples, [&](trk::Rng& rng, trk::PathCost& cost) {
-            return trk::trackBinary(medium, super, medium.ray(), settings, rng, cost)[0];
+            return trackBinary(medium, super, medium.ray(), settings, rng, cost)[0];
         });
         const double found = ratio.variance * ratio.lookups / (delta.variance * delta.lookups);
         std::printf(
@@ -236,7 +237,7 @@ TEST(Analytic, HomogeneousSuperVoxelsTakeNoLookupAndHaveNoNoise) {
         for (const double found : {ratio, residual, marched, exact}) {
             ASSERT_NEAR(found, T, 1e-9);
         }
-        binary += trk::trackBinary(field, superVoxels, local, settings, rng, cost)[0];
+        binary += trackBinary(field, superVoxels, local, settings, rng, cost)[0];
         const auto path = trk::sampleFreePath<true>(field, superVoxels, local, settings, rng, cost);
         ASSERT_TRUE(!path.collided || path.extinction[0] == 4 * static_cast<double>(0.03f));
         ASSERT_EQ(cost.lookups, 0u);

@@ -1,6 +1,8 @@
 // SPDX-License-Identifier: Apache-2.0
 #include "test_set.h"
 
+#include "analytic.h"
+
 #include "estimate/exact.h"
 #include "estimate/free_path.h"
 #include "estimate/plan.h"
@@ -181,13 +183,13 @@ std::array<double, 3> Scene::estimate(const PreparedRay& ray, const trk::Trackin
                                       trk::Rng& rng, trk::PathCost& cost) const {
     std::array<double, 3> result{};
     withFields([&](auto, const auto& field, const auto& superVoxels) {
-        const auto estimate = way.method == TRK_METHOD_DELTA
-                                  ? trk::trackBinary(field, superVoxels, ray.local, s, rng, cost)
-                              : way.method == TRK_METHOD_RATIO
-                                  ? trk::trackTransmittance<trk::Control::kNone>(
-                                        field, superVoxels, ray.local, s, rng, cost)
-                                  : trk::trackTransmittance<trk::Control::kChosen>(
-                                        field, superVoxels, ray.local, s, rng, cost);
+        const auto estimate =
+            way.method == TRK_METHOD_DELTA
+                ? analytic::trackBinary(field, superVoxels, ray.local, s, rng, cost)
+            : way.method == TRK_METHOD_RATIO ? trk::trackTransmittance<trk::Control::kNone>(
+                                                   field, superVoxels, ray.local, s, rng, cost)
+                                             : trk::trackTransmittance<trk::Control::kChosen>(
+                                                   field, superVoxels, ray.local, s, rng, cost);
         std::copy(estimate.begin(), estimate.end(), result.begin());
     });
     return result;

@@ -4,12 +4,14 @@
 #pragma once
 
 #include "plan.h"
+#include "room.h"
 #include "tracking.h"
 
 #include <algorithm>
 #include <array>
 #include <cmath>
 #include <cstddef>
+#include <cstdint>
 #include <limits>
 #include <utility>
 
@@ -167,9 +169,18 @@ void sampleExactly(const Field& field, const LocalRay& ray, double t0, double t1
 
 }  // namespace detail
 
-/// Samples a free path. With kDecompose, the minimum of each super-voxel is a control whose
-/// collisions need no look-up, and only the rest is tracked [Kutz17]; without, it is delta tracking
-/// [Woodcock65]. Homogeneous super-voxels need no look-up in either.
+/// Free paths go by the bounds of what they sample: collisions are a share of it, whatever was
+/// asked for.
+inline TrackingSettings freePathSettings(TrackingSettings settings) {
+    settings.rateBase = RateBase::kMajorant;
+    return settings;
+}
+
+/// A free path, through a plan that walks of the same ray may share. With one for
+/// Control::kMinimum, the minimum of each super-voxel is a control whose collisions need no
+/// look-up, and only the rest is tracked [Kutz17]; with one for kNone, it is delta tracking
+/// [Woodcock65]. Homogeneous super-voxels need no look-up in either. The plan must be made by
+/// freePathSettings.
 ///
 /// In grey and at rate 1, both take the same decisions from the same random numbers: what
 /// decomposition saves is the look-up where a collision is the control's, if the extinction there
@@ -179,124 +190,214 @@ void sampleExactly(const Field& field, const LocalRay& ray, double t0, double t1
 /// probability extinction / rate, and the weight stays 1. In colour they are real with the
 /// probability that the channels have together, each by its weight so far, and the weights make up
 /// for the difference (spectral tracking); their sum is kept, so none exceeds C [Kutz17].
-template <bool kDecompose, class Field, class SuperVoxels, class Random>
-FreePath<Field::kChannels> sampleFreePath(const Field& field, const SuperVoxels& superVoxels,
-                                          const LocalRay& ray, const TrackingSettings& settings,
-                                          Random& random, PathCost& cost) {
-    constexpr size_t C = Field::kChannels;
-    constexpr Control kControl = kDecompose ? Control::kMinimum : Control::kNone;
-    TrackingSettings bounded = settings;  // collisions are a share of a bound, whatever was asked
-    bounded.rateBase = RateBase::kMajorant;
-    Plan<kControl, SuperVoxels> plan(superVoxels, ray, bounded);
-    const MostLookups mostLookups(ray, settings);
-    FreePath<C> path;
-    double distance = random.exponential();  // in units of the rate; see RatioWalk
-    // Tracks a stretch, where `remaining` is what the rate makes of its length; whether the path
-    // goes on.
-    const auto track = [&](size_t i, double controlRate, double remaining) {
-        const double tExit = plan.tExit(i);
-        const double residualRate = plan.rate(i) / settings.lengthPerVoxel;
+template <class Field, class Plan, class Random>
+class FreePathWalk {
+  public:
+    static constexpr size_t C = Field::kChannels;
+
+    FreePathWalk(const Field& field, const Plan& plan, const LocalRay& ray,
+                 const TrackingSettings& settings, Random& random, PathCost& cost)
+        : field_(field),
+          plan_(plan),
+          ray_(ray),
+          settings_(settings),
+          random_(random),
+          cost_(cost),
+          distance_(random.exponential()) {}
+
+    /// Through what the plan has crossed; whether the path goes on behind it.
+    bool pass() {
+        double distance = distance_;
+        const size_t count = plan_.count();
+        size_t i = 0;
+        bool isRandom = false;
+        bool goesOn = true;
+        for (; i < count && goesOn; ++i) {
+            double controlRate = 0;
+            for (size_t c = 0; c < C; ++c) {
+                controlRate = std::max(controlRate, plan_.control(i, c, ray_.origin));
+            }
+            const double collisions =
+                plan_.collisions(i) + controlRate * settings_.lengthPerVoxel * plan_.length(i);
+            isRandom = isRandom || collisions > 0;
+            if (distance >= collisions) {
+                distance -= collisions;
+            } else {
+                distance_ = distance;
+                goesOn = track(i, controlRate, collisions);
+                distance = distance_;
+            }
+        }
+        distance_ = distance;
+        cost_.superVoxels += i;
+        cost_.random = cost_.random || isRandom;
+        return goesOn;
+    }
+    const FreePath<C>& path() const { return path_; }
+
+  private:
+    /// Tracks a stretch, where `remaining` is what the rate makes of its length; whether the path
+    /// goes on.
+    bool track(size_t i, double controlRate, double remaining) {
+        const double tExit = plan_.tExit(i);
+        const double residualRate = plan_.rate(i) / settings_.lengthPerVoxel;
         const double rate = controlRate + residualRate;
-        const double ratePerVoxel = rate * settings.lengthPerVoxel;
+        const double ratePerVoxel = rate * settings_.lengthPerVoxel;
         std::array<double, C> control;
         for (size_t c = 0; c < C; ++c) {
-            control[c] = plan.control(i, c, ray.origin);  // the same everywhere
+            control[c] = plan_.control(i, c, ray_.origin);  // the same everywhere
         }
         // Where a ray meets little of what the rate covers, null collisions would never end. After
         // as many as integrating exactly takes, that is what is done with the rest: having come so
         // far, how to go on is free.
-        double budget = mostLookups(plan.length(i));
-        while (distance < remaining) {
-            remaining -= distance;
-            distance = random.exponential();
-            path.t = tExit - remaining / ratePerVoxel;
-            const double u = residualRate > 0 ? random.uniform() * rate : 0.0;
+        double budget = MostLookups(ray_, settings_)(plan_.length(i));
+        while (distance_ < remaining) {
+            remaining -= distance_;
+            distance_ = random_.exponential();
+            path_.t = tExit - remaining / ratePerVoxel;
+            const double u = residualRate > 0 ? random_.uniform() * rate : 0.0;
             const bool ofControl = u < controlRate;
             std::array<double, C> extinction = control;
             if (!ofControl) {
-                extinction = field.extinction(ray.at(path.t));
-                ++cost.lookups;
+                extinction = field_.extinction(ray_.at(path_.t));
+                ++cost_.lookups;
             }
             if constexpr (C == 1) {
-                path.collided = ofControl || u - controlRate < extinction[0] - control[0];
+                path_.collided = ofControl || u - controlRate < extinction[0] - control[0];
             } else {
-                const double part = ofControl ? controlRate : residualRate;
-                std::array<double, C> real;
-                double realSum = 0;
-                double sum = 0;
-                for (size_t c = 0; c < C; ++c) {
-                    // Rounding may leave less than nothing, or more than everything.
-                    real[c] = ofControl ? control[c]
-                                        : std::fmin(std::fmax(extinction[c] - control[c], 0), part);
-                    realSum += path.weight[c] * real[c];
-                    sum += path.weight[c] * part;
-                }
-                const double probability = realSum / sum;
-                path.collided = random.uniform() < probability;
-                for (size_t c = 0; c < C; ++c) {
-                    path.weight[c] *= path.collided ? real[c] / (part * probability)
-                                                    : (part - real[c]) / (part * (1 - probability));
-                }
+                collideInColour(extinction, control, ofControl,
+                                ofControl ? controlRate : residualRate);
             }
-            if (path.collided) {
-                if (ofControl && residualRate > 0 && settings.wantsExtinction) {
-                    extinction = field.extinction(ray.at(path.t));
-                    ++cost.lookups;
+            if (path_.collided) {
+                if (ofControl && residualRate > 0 && settings_.wantsExtinction) {
+                    extinction = field_.extinction(ray_.at(path_.t));
+                    ++cost_.lookups;
                 }
-                path.extinction = extinction;
+                path_.extinction = extinction;
                 return false;
             }
             if (--budget < 0) {
-                detail::sampleExactly(field, ray, path.t, tExit, settings.lengthPerVoxel, random,
-                                      cost, path);
-                return !path.collided;
+                detail::sampleExactly(field_, ray_, path_.t, tExit, settings_.lengthPerVoxel,
+                                      random_, cost_, path_);
+                return !path_.collided;
             }
         }
-        distance -= remaining;
+        distance_ -= remaining;
         return true;
-    };
-    while (plan.next() > 0) {
-        for (size_t i = 0; i < plan.count(); ++i) {
-            ++cost.superVoxels;
-            double controlRate = 0;
-            for (size_t c = 0; c < C; ++c) {
-                controlRate = std::max(controlRate, plan.control(i, c, ray.origin));
-            }
-            const double remaining =
-                plan.collisions(i) + controlRate * settings.lengthPerVoxel * plan.length(i);
-            cost.random = cost.random || remaining > 0;
-            if (distance >= remaining) {
-                distance -= remaining;
-            } else if (!track(i, controlRate, remaining)) {
-                return path;
-            }
+    }
+    /// Whether a collision is real, and what that makes of the weights. `part`: the rate of those
+    /// of its kind, of the control or of the residual.
+    void collideInColour(const std::array<double, C>& extinction,
+                         const std::array<double, C>& control, bool ofControl, double part) {
+        std::array<double, C> real;
+        double realSum = 0;
+        double sum = 0;
+        for (size_t c = 0; c < C; ++c) {
+            // Rounding may leave less than nothing, or more than everything.
+            real[c] =
+                ofControl ? control[c] : std::fmin(std::fmax(extinction[c] - control[c], 0), part);
+            realSum += path_.weight[c] * real[c];
+            sum += path_.weight[c] * part;
+        }
+        const double probability = realSum / sum;
+        path_.collided = random_.uniform() < probability;
+        for (size_t c = 0; c < C; ++c) {
+            path_.weight[c] *= path_.collided ? real[c] / (part * probability)
+                                              : (part - real[c]) / (part * (1 - probability));
         }
     }
-    return path;
+
+    const Field& field_;
+    const Plan& plan_;
+    const LocalRay& ray_;
+    const TrackingSettings& settings_;
+    Random& random_;
+    PathCost& cost_;
+    FreePath<C> path_;
+    double distance_;  // to the next collision, in units of the rate; see RatioWalk
+};
+
+/// A free path of one ray, by decomposition tracking or delta tracking.
+template <bool kDecompose, class Field, class SuperVoxels, class Random>
+FreePath<Field::kChannels> sampleFreePath(const Field& field, const SuperVoxels& superVoxels,
+                                          const LocalRay& ray, const TrackingSettings& settings,
+                                          Random& random, PathCost& cost) {
+    const TrackingSettings bounded = freePathSettings(settings);
+    Plan<kDecompose ? Control::kMinimum : Control::kNone, SuperVoxels> plan(superVoxels, ray,
+                                                                            bounded);
+    FreePathWalk walk(field, std::as_const(plan), ray, bounded, random, cost);
+    while (plan.next() > 0 && walk.pass()) {
+    }
+    return walk.path();
 }
 
-/// One estimate of the transmittance of the whole ray by delta tracking, per channel: whether a
-/// photon passes, 1 or 0. Each channel takes a walk of its own.
+namespace detail {
+
+/// How many of a ray's photons go through a plan together.
+inline constexpr size_t kPhotons = 16;
+
+/// Whether the photons of `count` random numbers pass.
 template <class Field, class SuperVoxels, class Random>
-std::array<double, Field::kChannels> trackBinary(const Field& field, const SuperVoxels& superVoxels,
-                                                 const LocalRay& ray,
-                                                 const TrackingSettings& settings, Random& random,
-                                                 PathCost& cost) {
+void trackPhotons(const Field& field, const SuperVoxels& superVoxels, const LocalRay& ray,
+                  const TrackingSettings& settings, Room<Random>* randoms, size_t count,
+                  PathCost& cost, std::array<double, Field::kChannels>* passes) {
     constexpr size_t C = Field::kChannels;
     if constexpr (C == 1) {
-        const auto path = sampleFreePath<false>(field, superVoxels, ray, settings, random, cost);
-        return {{path.collided ? 0.0 : 1.0}};
+        using RayPlan = Plan<Control::kNone, SuperVoxels>;
+        RayPlan plan(superVoxels, ray, settings);
+        Room<FreePathWalk<Field, RayPlan, Random>> walks[kPhotons];
+        size_t flying[kPhotons];
+        for (size_t i = 0; i < count; ++i) {
+            walks[i].emplace(field, plan, ray, settings, randoms[i].object, cost);
+            flying[i] = i;
+        }
+        for (size_t left = count; left > 0 && plan.next() > 0;) {
+            size_t kept = 0;
+            for (size_t k = 0; k < left; ++k) {
+                flying[kept] = flying[k];
+                kept += walks[flying[k]].object.pass() ? 1 : 0;
+            }
+            left = kept;
+        }
+        for (size_t i = 0; i < count; ++i) {
+            passes[i][0] = walks[i].object.path().collided ? 0.0 : 1.0;
+        }
     } else {
-        std::array<double, C> result;
         const double exactBefore = cost.exactLength;
         for (size_t c = 0; c < C; ++c) {
-            const detail::OneChannelField<Field> oneField{field, c};
-            const detail::OneChannelWalk<SuperVoxels> oneWalk{superVoxels, c};
-            result[c] = trackBinary(oneField, oneWalk, ray, settings, random, cost)[0];
+            const OneChannelField<Field> oneField{field, c};
+            const OneChannelWalk<SuperVoxels> oneWalk{superVoxels, c};
+            std::array<double, 1> ofChannel[kPhotons];
+            trackPhotons(oneField, oneWalk, ray, settings, randoms, count, cost, ofChannel);
+            for (size_t i = 0; i < count; ++i) {
+                passes[i][c] = ofChannel[i][0];
+            }
         }
         cost.exactLength =
             exactBefore + (cost.exactLength - exactBefore) / static_cast<double>(C);  // of a walk
-        return result;
+    }
+}
+
+}  // namespace detail
+
+/// `samples` estimates of the transmittance of the whole ray by delta tracking, per channel:
+/// whether a photon passes, 1 or 0. Each channel takes walks of its own. `randomOf(sample)`: the
+/// random numbers of one; take(passes) is called for each, in order.
+template <class Field, class SuperVoxels, class RandomOf, class Take>
+void trackBinary(const Field& field, const SuperVoxels& superVoxels, const LocalRay& ray,
+                 const TrackingSettings& settings, uint32_t samples, const RandomOf& randomOf,
+                 PathCost& cost, const Take& take) {
+    const TrackingSettings bounded = freePathSettings(settings);
+    Room<decltype(randomOf(0))> randoms[detail::kPhotons];
+    std::array<double, Field::kChannels> passes[detail::kPhotons];
+    for (uint32_t first = 0; first < samples;) {
+        const uint32_t count = std::min(samples - first, uint32_t{detail::kPhotons});
+        for (uint32_t i = 0; i < count; ++i) {
+            randoms[i].emplace(randomOf(first + i));
+        }
+        detail::trackPhotons(field, superVoxels, ray, bounded, randoms, count, cost, passes);
+        std::for_each_n(passes, count, take);
+        first += count;
     }
 }
 

@@ -29,6 +29,8 @@ enum class Control {
 /// The plan of a ray, a few stretches at a time: next() crosses some, in short loops over them, and
 /// those from 0 to count() - 1 are they until it is called again. It goes by ray, settings and
 /// baked numbers alone, never by what is looked up: were it otherwise, estimates would be biased.
+/// So any number of estimates of one ray may share it, each going through the stretches that are
+/// there before it is told to go on.
 ///
 /// C channels go one walk, whose rate of collisions covers the largest of their bounds.
 /// `superVoxels` is a Variant's Walk, or anything like it; it, ray and settings must live as long.

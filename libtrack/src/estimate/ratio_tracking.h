@@ -92,35 +92,46 @@ class Throughput {
 ///
 /// Where collisions are does not depend on what is found there. So a walk goes by chunks: advance()
 /// draws collisions in the stretches of a plan, prefetch() and weigh() look them up, and only then
-/// roulette judges the weights. Between these steps other rays may take theirs, while memory
-/// answers.
+/// roulette judges the weights. Between these steps other walks may take theirs, while memory
+/// answers; those of one ray may share its plan. See trackTransmittance.
 ///
-/// kControl: Control::kNone for ratio tracking, kChosen for residual ratio tracking.
-/// `field.extinction` and `field.integrate` yield the extinction of Field::kChannels channels. All
+/// `field.extinction` and `field.integrate` yield the extinction of Field::kChannels channels; the
+/// plan is for ratio tracking with Control::kNone, for residual ratio tracking with kChosen. All
 /// arguments must live as long.
-template <Control kControl, class Field, class SuperVoxels, class Random>
+template <class Field, class Plan, class Random>
 class RatioWalk {
   public:
     static constexpr size_t C = Field::kChannels;
 
-    RatioWalk(const Field& field, const SuperVoxels& superVoxels, const LocalRay& ray,
+    RatioWalk(const Field& field, const Plan& plan, const LocalRay& ray,
               const TrackingSettings& settings, Random& random, PathCost& cost)
         : field_(field),
+          plan_(plan),
           ray_(ray),
           settings_(settings),
           random_(random),
           cost_(cost),
-          plan_(superVoxels, ray, settings),
           distance_(random.exponential()) {}
 
-    /// Up to the next few collisions; false where there are none left.
-    bool advance() {
-        count_ = 0;
-        while (count_ < kChunk && (isInside_ || enterNext())) {
-            collideOrLeave();
+    /// Into what the plan has crossed.
+    void enter() { at_ = 0; }
+    /// What a walk came to.
+    enum class State {
+        kWeighs,  ///< collisions were drawn and are to be weighed
+        kWaits,   ///< for the plan to go on; there may be collisions all the same
+        kEnded    ///< what comes cannot change the result any more
+    };
+    /// Up to where it cannot go on by itself.
+    State advance() {
+        if (state_ != State::kEnded) {
+            state_ = State::kWeighs;
+            while (count_ < kChunk && (isInside_ || enterNext())) {
+                collideOrLeave();
+            }
         }
-        return count_ > 0;
+        return state_;
     }
+    State state() const { return state_; }
 
     /// Of the collisions that were drawn: asks memory for them.
     void prefetch() const {
@@ -129,8 +140,8 @@ class RatioWalk {
         }
     }
 
-    /// Looks the collisions up; false where the walk has ended.
-    bool weigh() {
+    /// Looks the collisions up.
+    void weigh() {
         for (size_t i = 0; i < count_; ++i) {
             const Collision& collision = collisions_[i];
             const auto extinction = field_.extinction(collision.point);
@@ -142,15 +153,16 @@ class RatioWalk {
             }
         }
         cost_.lookups += count_;
-        if (isDone_) {  // nothing is left for roulette to spare
-            return false;
-        }
+        count_ = 0;
         // What is left of the stretch that the walk is in does not count, nor does its control: it
-        // may still be needed to outweigh collisions that amplify.
-        if (!settings_.roulette) {
-            return !sofar_.isZero();
+        // may still be needed to outweigh collisions that amplify. At the end of the ray, nothing
+        // is left for roulette to spare.
+        if (settings_.roulette && state_ == State::kWeighs) {
+            sofar_.survives(depthAhead(at_ + (isInside_ ? 1 : 0)), random_, cost_.random);
         }
-        return sofar_.survives(depthAhead(at_ + (isInside_ ? 1 : 0)), random_, cost_.random);
+        if (sofar_.isZero()) {
+            state_ = State::kEnded;
+        }
     }
 
     std::array<double, C> result() const {
@@ -187,15 +199,10 @@ class RatioWalk {
             pass();
             if (at_ == plan_.count()) {
                 // As long as all was homogeneous, walks do not end.
-                if (settings_.roulette && isRandom_ && !goesOn(at_)) {
-                    return false;
+                if (!settings_.roulette || !isRandom_ || goesOn(at_)) {
+                    state_ = State::kWaits;
                 }
-                at_ = 0;
-                if (plan_.next() == 0) {
-                    isDone_ = true;
-                    return false;
-                }
-                continue;
+                return false;
             }
             if (settings_.roulette && !goesOn(at_)) {
                 return false;
@@ -221,8 +228,16 @@ class RatioWalk {
     /// Whether to go on to stretch i: roulette, unless something is left to be weighed.
     bool goesOn(size_t i) {
         const std::array<double, C> depth = depthAhead(i);
-        return sofar_.matters(depth) ||
-               (count_ == 0 && sofar_.survives(depth, random_, cost_.random));
+        if (sofar_.matters(depth)) {
+            return true;
+        }
+        if (count_ == 0) {
+            if (sofar_.survives(depth, random_, cost_.random)) {
+                return true;
+            }
+            state_ = State::kEnded;
+        }
+        return false;
     }
 
     /// Passes stretches as long as nothing happens in them but what is integrated.
@@ -275,34 +290,44 @@ class RatioWalk {
     }
 
     const Field& field_;
+    const Plan& plan_;
     const LocalRay& ray_;
     const TrackingSettings& settings_;
     Random& random_;
     PathCost& cost_;
-    Plan<kControl, SuperVoxels> plan_;
-    size_t at_ = 0;  // of its stretches
+    size_t at_ = 0;  // of the plan's stretches
     Throughput<C> sofar_;
     bool isRandom_ = false;  // another walk might have had another result, roulette apart
     bool isInside_ = false;  // a stretch, not done with its collisions
-    bool isDone_ = false;    // nor is there another one
-    double remaining_ = 0;   // optical distances: to its end
-    double distance_;        // and to the next collision
+    State state_ = State::kWeighs;
+    double remaining_ = 0;  // optical distances: to its end
+    double distance_;       // and to the next collision
     size_t count_ = 0;
     Collision collisions_[kChunk];
 };
 
-/// The walk of one ray alone.
+/// One estimate of one ray. kControl: Control::kNone for ratio tracking, kChosen for residual ratio
+/// tracking.
 template <Control kControl, class Field, class SuperVoxels, class Random>
 std::array<double, Field::kChannels> trackTransmittance(const Field& field,
                                                         const SuperVoxels& superVoxels,
                                                         const LocalRay& ray,
                                                         const TrackingSettings& settings,
                                                         Random& random, PathCost& cost) {
-    RatioWalk<kControl, Field, SuperVoxels, Random> walk(field, superVoxels, ray, settings, random,
-                                                         cost);
-    while (walk.advance() && walk.weigh()) {
+    Plan<kControl, SuperVoxels> plan(superVoxels, ray, settings);
+    RatioWalk walk(field, std::as_const(plan), ray, settings, random, cost);
+    for (;;) {
+        using State = typename decltype(walk)::State;
+        const State state = walk.advance();
+        if (state == State::kWaits && plan.next() > 0) {
+            walk.enter();
+            continue;
+        }
+        walk.weigh();
+        if (state != State::kWeighs) {
+            return walk.result();
+        }
     }
-    return walk.result();
 }
 
 }  // namespace trk

@@ -1,0 +1,25 @@
+// SPDX-License-Identifier: Apache-2.0
+// Room for objects that are made when they are needed.
+#pragma once
+
+#include <new>
+#include <type_traits>
+#include <utility>
+
+namespace trk {
+
+/// Room for an object of which most queries of one ray make none, or few of many.
+template <class T>
+union Room {
+    static_assert(std::is_trivially_destructible_v<T>);
+
+    Room() {}
+    template <class... Arguments>
+    void emplace(Arguments&&... arguments) {
+        new (static_cast<void*>(&object)) T(std::forward<Arguments>(arguments)...);
+    }
+
+    T object;
+};
+
+}  // namespace trk

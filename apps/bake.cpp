@@ -3,6 +3,7 @@
 #include "command_line.h"
 
 #include "bake/bake.h"
+#include "bake/write_bake.h"
 #include "io/density.h"
 #include "io/sidecar.h"
 

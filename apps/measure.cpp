@@ -2,6 +2,7 @@
 // vdbtrack measure: what each method, control, size and rate costs and buys on a volume.
 #include "command_line.h"
 
+#include "bake/write_bake.h"
 #include "failure.h"
 #include "io/density.h"
 #include "io/output_file.h"

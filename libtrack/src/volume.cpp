@@ -2,6 +2,7 @@
 #include "volume.h"
 
 #include "bake/bake.h"
+#include "bake/write_bake.h"
 #include "failure.h"
 #include "io/density.h"
 #include "io/sidecar.h"

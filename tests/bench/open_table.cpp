@@ -4,6 +4,7 @@
 // what a dense array in memory costs over bricks of a tree. All in one run, interleaved, medians of
 // several rounds of wall time; files lie in the system's cache.
 #include "bake/bake.h"
+#include "bake/write_bake.h"
 #include "support/fixtures.h"
 #include "track/track.hpp"
 #include "track/track_openvdb.hpp"

@@ -1,6 +1,7 @@
 // SPDX-License-Identifier: Apache-2.0
 // That the standard errors `vdbtrack query` prints are those of what it prints, and that those of
 // the API never claim a certainty there is none of.
+#include "bake/write_bake.h"
 #include "measure/known_error.h"
 #include "measure/sweep_rays.h"
 #include "parallel.h"

@@ -2,6 +2,7 @@
 #include "fixtures.h"
 
 #include "bake/bake.h"
+#include "bake/write_bake.h"
 #include "make/procedural.h"
 
 #include <unistd.h>

@@ -1,6 +1,7 @@
 // SPDX-License-Identifier: Apache-2.0
 // Lit previews: what their layers mean, and that they come nearer as super-voxels shrink.
 #include "bake/preview_scale.h"
+#include "bake/write_bake.h"
 #include "failure.h"
 #include "io/sidecar.h"
 #include "query/transmittance.h"

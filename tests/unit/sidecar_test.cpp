@@ -4,6 +4,7 @@
 #include "field/table_builder.h"
 
 #include "bake/bake.h"
+#include "bake/write_bake.h"
 #include "bake/verify.h"
 #include "failure.h"
 #include "io/vdb_file.h"

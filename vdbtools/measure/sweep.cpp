@@ -1,6 +1,7 @@
 // SPDX-License-Identifier: Apache-2.0
 #include "sweep.h"
 
+#include "bake/write_bake.h"
 #include "estimate/ratio_tracking.h"
 #include "failure.h"
 #include "io/sidecar.h"

@@ -1,11 +1,11 @@
 // SPDX-License-Identifier: Apache-2.0
-// Statistics, control and preview levels of a density: what a sidecar stores.
+// Statistics, control and preview levels of a density: what a sidecar stores. write_bake.h writes
+// one.
 #pragma once
 
 #include "control/super_voxels.h"
 #include "field/brick_pages.h"
 #include "field/density_field.h"
-#include "io/sidecar.h"
 
 #include <cstdint>
 #include <string>
@@ -38,18 +38,6 @@ struct BakeEstimate {
     uint64_t bytes = 0;
 };
 BakeEstimate estimateBake(const DensityField& field, const BakeOptions& options);
-
-/// How large a sidecar of a density of `sourceBytes` as a file may be, pictures included.
-uint64_t sidecarLimit(uint64_t sourceBytes, ControlKind kind);
-
-/// What a sidecar of such a bake says of itself.
-SidecarHeader sidecarHeader(const DensitySummary& source, BrickPages pages,
-                            const BakedVolume& baked);
-
-/// Writes a bake as a sidecar of at most `sidecarBytes`, for which its pictures become coarser
-/// where they must. Does not commit.
-SidecarHeader writeBake(const OutputFile& file, const DensitySummary& source, BrickPages pages,
-                        BakedVolume& baked, uint64_t sidecarBytes);
 
 /// How well a bake's control fits, over all occupied super-voxels and channels.
 struct ControlFit {

@@ -239,8 +239,9 @@ void run(const Command& command, const std::vector<std::string>& given) {
     if (shot.lit) {
         const Progress progress(arguments, "lighting " + shot.sidecar);
         lit = std::make_unique<vdbtools::LitPreview>(
-            shot.sidecar, vdbtools::LitOptions{shot.level, shot.scale, shot.color, shot.up,
-                                               shot.azimuth, shot.elevation});
+            shot.sidecar,
+            vdbtools::LitOptions{
+                shot.level, shot.scale, shot.color, {shot.up, shot.azimuth, shot.elevation}});
     }
     if (!arguments.has("camera")) {
         frame(shot, volume, lit.get());

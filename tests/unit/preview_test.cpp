@@ -305,8 +305,8 @@ TEST(Preview, TheSunIsWhereItIsSaidToBe) {
         for (const double azimuth : {0.0, 90.0, 200.0}) {
             vdbtools::LitOptions options = litOptions(0, 5);
             options.up = up;
-            options.azimuth = azimuth;
-            options.elevation = 20;
+            options.sun.azimuth = azimuth;
+            options.sun.elevation = 20;
             const LitPreview lit(sidecar, options);
             const double a = azimuth * 3.14159265358979323846 / 180;
             const trk::Vec3d sun =

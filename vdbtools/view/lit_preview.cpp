@@ -2,7 +2,6 @@
 #include "lit_preview.h"
 
 #include "failure.h"
-#include "field/table_builder.h"
 #include "io/sidecar.h"
 #include "io/sidecar_schema.h"
 #include "parallel.h"
@@ -11,8 +10,6 @@
 #include <algorithm>
 #include <atomic>
 #include <cmath>
-#include <limits>
-#include <utility>
 
 namespace vdbtools {
 
@@ -25,33 +22,6 @@ using trk::Vec3d;
 namespace {
 
 using Color = std::array<double, 3>;
-
-// A clear late afternoon. Radiances are relative; a white surface in the sun would be about 1.
-constexpr Color kSun{{0.98, 0.89, 0.74}};  // already over 4 pi, the isotropic phase function
-constexpr Color kZenith{{0.30, 0.48, 0.86}};
-constexpr Color kHorizon{{0.62, 0.72, 0.84}};
-constexpr Color kGround{{0.24, 0.21, 0.18}};
-constexpr int kSkyDirections = 20;
-constexpr int kSunDirections = 5;
-constexpr double kSunRadius = 5;  // degrees
-// In super-voxels. A place's own super-voxel is left out of its shadow: the light is tabulated
-// where the interpolated control is largest, and would show the grid of those places as dark dots.
-constexpr double kShadowStart = 1;
-constexpr int kShadowSteps = 1;
-constexpr double kShadowSpread = 1.5;
-// Along the longest side of what is drawn, places of which the light is computed: light varies less
-// than density, and a volume of more cells has cells the size of a pixel.
-constexpr int64_t kMostPlaces = 128;
-
-/// `height`: of a direction of unit length.
-Color skyRadiance(double height) {
-    Color radiance;
-    for (size_t k = 0; k < 3; ++k) {
-        radiance[k] =
-            height < 0 ? kGround[k] : kHorizon[k] + (kZenith[k] - kHorizon[k]) * std::sqrt(height);
-    }
-    return radiance;
-}
 
 trk::Volume openLevel(const std::string& path, const LitOptions& lit) {
     using namespace trk::schema;
@@ -70,14 +40,6 @@ trk::Volume openLevel(const std::string& path, const LitOptions& lit) {
     options.scale = lit.scale;
     options.color = lit.color;
     return trk::openVolume(path.c_str(), "", options);
-}
-
-/// One of `count` directions spread evenly over the sphere.
-Vec3d spreadDirection(int i, int count) {
-    const double y = 1 - (2 * i + 1.0) / count;
-    const double angle = 2.39996322972865332 * i;  // the golden angle
-    const double r = std::sqrt(1 - y * y);
-    return {{r * std::cos(angle), y, r * std::sin(angle)}};
 }
 
 /// In how many stretches a cell, or a constant region, is lit: more where much is absorbed, as most
@@ -114,42 +76,77 @@ class DepthInCell {
     double whole_;
 };
 
-/// Cells of a brick's edge between whose corners light is interpolated: all of them, unless there
-/// would be too many.
-int64_t lightCells(const trk::IntBox& box) {
-    int64_t longest = 0;
-    for (size_t a = 0; a < 3; ++a) {
-        longest = std::max(longest, box.hi[a] - box.lo[a]);
-    }
-    int64_t cells = DensityField::kBrickSize;
-    while (cells > 1 && longest * cells / DensityField::kBrickSize > kMostPlaces) {
-        cells /= 2;
-    }
-    return cells;
-}
+/// What a camera ray gathers, stretch by stretch: in each, light counts as constant.
+class GatheredLight {
+  public:
+    /// `start`: where the local ray begins, from the camera; `lengthPerVoxel`: of its t.
+    /// `farDepth`: see Picture::halfDepth.
+    GatheredLight(double start, double lengthPerVoxel, double farDepth)
+        : start_(start), lengthPerVoxel_(lengthPerVoxel), halfDepth_(farDepth) {}
 
-/// Whether the light at a vertex of a brick is ever looked up: a cell beside it, `step` voxels
-/// wide, holds something. In constant regions it always is.
-bool isNeeded(const DensityField& field, SparseTable::Entry entry, const Int3& at, int64_t step) {
-    if (DensityField::isConstant(entry)) {
-        return true;
-    }
-    constexpr int64_t kEdge = DensityField::kBrickEdge;
-    const auto lo = [&](size_t a) { return std::max<int64_t>(at[a] - step, 0); };
-    const auto hi = [&](size_t a) { return std::min<int64_t>(at[a] + step, kEdge - 1); };
-    for (int64_t x = lo(0); x <= hi(0); ++x) {
-        for (int64_t y = lo(1); y <= hi(1); ++y) {
-            for (int64_t z = lo(2); z <= hi(2); ++z) {
-                for (size_t c = 0; c < field.channels(); ++c) {
-                    const auto vertex = static_cast<size_t>((x * kEdge + y) * kEdge + z);
-                    if (field.vertex(entry, vertex, c) > 0) {
-                        return true;
-                    }
-                }
-            }
+    /// `passed`: the transmittance of the stretch, of one channel or three.
+    template <size_t C>
+    void addStretch(double t0, double t1, const std::array<double, C>& passed, const Light& light) {
+        const double before = mean();
+        for (size_t k = 0; k < 3; ++k) {
+            const double p = passed[k % C];
+            radiance_[k] += transmittance_[k] * (1 - p) * static_cast<double>(light[k]);
+            transmittance_[k] *= p;
+        }
+        const double after = mean();
+        if (before > 0.5 && after <= 0.5) {
+            const double within = std::log(before / 0.5) / std::log(before / after);
+            halfDepth_ = start_ + lengthPerVoxel_ * (t0 + within * (t1 - t0));
         }
     }
-    return false;
+    /// Whether what lies behind can still be seen.
+    bool isOpen() const {
+        constexpr double kOpaque = 1e-5;
+        return std::max({transmittance_[0], transmittance_[1], transmittance_[2]}) > kOpaque;
+    }
+    void write(Picture& picture, size_t pixel) const {
+        for (size_t k = 0; k < 3; ++k) {
+            picture.transmittance[k][pixel] = static_cast<float>(transmittance_[k]);
+            picture.light[k][pixel] = static_cast<float>(radiance_[k]);
+        }
+        picture.halfDepth[pixel] = static_cast<float>(halfDepth_);
+    }
+
+  private:
+    double mean() const { return (transmittance_[0] + transmittance_[1] + transmittance_[2]) / 3; }
+
+    double start_;
+    double lengthPerVoxel_;
+    double halfDepth_;
+    Color radiance_{};
+    Color transmittance_{{1, 1, 1}};
+};
+
+/// Of a cell, or a constant region, whose optical depths are not all 0: as many stretches as it
+/// takes. `densityAt(t)`: the density along the ray, whatever its unit.
+template <size_t C, class DensityAt>
+void gatherCell(double t0, double t1, const std::array<double, C>& depth,
+                const DensityAt& densityAt, const LocalRay& ray, const LightTable& light,
+                GatheredLight& gathered) {
+    const int count = stretchCount(t1 - t0, *std::max_element(depth.begin(), depth.end()));
+    const auto place = [&](double share) { return t0 + share * (t1 - t0); };
+    // Of one stretch, nobody asks where in it.
+    const DepthInCell depthIn([&](double s) { return count > 1 ? densityAt(place(s)) : 0.0; });
+    double from = 0;  // shares of the length, and of the depth
+    double depthFrom = 0;
+    for (int i = 1; i <= count; ++i) {
+        const double to = static_cast<double>(i) / count;
+        const double depthTo = i == count ? 1 : depthIn.share(to);
+        std::array<double, C> passed;
+        for (size_t c = 0; c < C; ++c) {
+            passed[c] = std::exp(-depth[c] * std::max(depthTo - depthFrom, 0.0));
+        }
+        const double start = place(from);
+        const double end = place(to);
+        gathered.addStretch(start, end, passed, light.at(ray.at(0.5 * (start + end))));
+        from = to;
+        depthFrom = depthTo;
+    }
 }
 
 }  // namespace
@@ -165,189 +162,18 @@ std::array<float, 3> skyBehind(double y) {
 }
 
 LitPreview::LitPreview(const std::string& sidecarPath, const LitOptions& options)
-    : sources_(makeSources(options)), volume_(openLevel(sidecarPath, options)) {
-    tabulateLight();
-}
-
-/// The sun, and the sky as directions spread evenly over the sphere.
-std::vector<LitPreview::Source> LitPreview::makeSources(const LitOptions& options) {
-    constexpr double kDegree = 3.14159265358979323846 / 180;
-    std::vector<Source> list;
-    // A wide sun, as several directions, and each of all directions from a place of its own around
-    // the one that light is computed for: from that alone, shadows would show the grid of those
-    // places.
-    const auto add = [&](const Vec3d& towards, const Vec3d& offset, Color radiance, int count) {
-        for (double& c : radiance) {
-            c /= count;
-        }
-        list.push_back({toWorld(options.up, towards), kShadowSpread * offset, radiance});
-    };
-    for (int i = 0; i < kSunDirections; ++i) {
-        const double turn = 2 * kDegree * 180 * i / kSunDirections;
-        const double azimuth = kDegree * (options.azimuth + kSunRadius * std::cos(turn));
-        const double elevation = kDegree * (options.elevation + kSunRadius * std::sin(turn));
-        add({{std::cos(elevation) * std::sin(azimuth), std::sin(elevation),
-              std::cos(elevation) * std::cos(azimuth)}},
-            spreadDirection(i, kSunDirections), kSun, kSunDirections);
-    }
-    for (int i = 0; i < kSkyDirections; ++i) {
-        const Vec3d towards = spreadDirection(i, kSkyDirections);
-        add(towards, spreadDirection((7 * i) % kSkyDirections, kSkyDirections),
-            skyRadiance(towards[1]), kSkyDirections);
-    }
-    return list;
-}
-
-/// All light that arrives at a place, through what of the volume is in its way.
-LitPreview::Light LitPreview::computeLight(const Vec3d& local) const {
-    Vec3d index = local;
-    for (int a = 0; a < 3; ++a) {
-        index[a] += static_cast<double>(volume_.anchor[static_cast<size_t>(a)]);
-    }
-    Color sum{};
-    trk::withVariant(volume_, trk::ControlKind::kConstant, [&](auto variant) {
-        using V = decltype(variant);
-        const typename V::Extinction extinction(volume_);
-        for (const Source& source : sources_) {
-            const Vec3d world = volume_.indexToWorld.point(index + source.offset);
-            TrkRay ray;
-            for (int a = 0; a < 3; ++a) {
-                ray.origin[a] = static_cast<float>(world[a]);
-                ray.direction[a] = static_cast<float>(source.towards[a]);
-            }
-            ray.tMin = 0;
-            ray.tMax = std::numeric_limits<float>::infinity();
-            std::array<double, V::kChannels> depth{};
-            const auto clipped = volume_.clip(ray, volume_.field->box());
-            for (int i = 0; clipped && i <= kShadowSteps; ++i) {
-                const double from = kShadowStart + i;
-                const double to = i < kShadowSteps ? std::min(from + 1, clipped->local.tEnd)
-                                                   : clipped->local.tEnd;
-                if (from < to) {
-                    uint64_t ignored = 0;
-                    const auto part =
-                        extinction.integrate(clipped->local, from, to, ignored, ignored);
-                    for (size_t c = 0; c < V::kChannels; ++c) {
-                        depth[c] += (i + 1.0) / (kShadowSteps + 1) * part[c];
-                    }
-                }
-            }
-            const double lengthPerVoxel = clipped ? clipped->lengthPerVoxel : 0.0;
-            for (size_t k = 0; k < 3; ++k) {
-                sum[k] += source.radiance[k] * std::exp(-lengthPerVoxel * depth[k % V::kChannels]);
-            }
-        }
-    });
-    Light light;
-    std::transform(sum.begin(), sum.end(), light.begin(),
-                   [](double v) { return static_cast<float>(v); });
-    return light;
-}
-
-/// Tabulates the light at the corners of a brick's cells, of those that hold anything, and more
-/// coarsely in constant regions.
-void LitPreview::tabulateLight() {
-    const DensityField& field = *volume_.field;
-    const int64_t brickCells = lightCells(field.box());
-    size_t places = 0;
-    const auto add = [&](const Int3& origin, int shift, SparseTable::Entry entry) {
-        const bool coarse = DensityField::isConstant(entry) && shift == DensityField::kBrickShift;
-        const int64_t cells = coarse ? 1 : brickCells;
-        regions_.push_back({origin, shift, entry, cells, places});
-        places += static_cast<size_t>((cells + 1) * (cells + 1) * (cells + 1));
-        return static_cast<SparseTable::Entry>(regions_.size());
-    };
-    table_ = trk::TableBuilder(DensityField::kBrickShift, field.box())
-                 .fill(
-                     {&field.table()},
-                     [&](const Int3& origin, int shift) -> std::optional<SparseTable::Entry> {
-                         const auto found = field.table().find(origin[0], origin[1], origin[2]);
-                         if (found.shift < shift || !DensityField::isConstant(found.entry)) {
-                             return std::nullopt;
-                         }
-                         return found.entry == SparseTable::kEmpty
-                                    ? SparseTable::kEmpty
-                                    : add(origin, shift, found.entry);
-                     },
-                     [&](const Int3& origin) {
-                         const auto found = field.table().find(origin[0], origin[1], origin[2]);
-                         return add(origin, DensityField::kBrickShift, found.entry);
-                     });
-    light_.resize(places);
-    trk::parallelFor(regions_.size(), 1, [&](size_t r) {
-        const Region& region = regions_[r];
-        const int64_t edge = region.cells + 1;
-        trk::parallelFor(static_cast<size_t>(edge * edge * edge), 1, [&](size_t k) {
-            const auto i = static_cast<int64_t>(k);
-            const Int3 at{{i / (edge * edge), i / edge % edge, i % edge}};
-            const double spacing =
-                std::ldexp(1.0, region.shift) / static_cast<double>(region.cells);
-            const auto step = static_cast<int64_t>(spacing);  // of a brick
-            if (!isNeeded(field, region.entry, {{step * at[0], step * at[1], step * at[2]}},
-                          step)) {
-                return;
-            }
-            Vec3d place;
-            for (size_t a = 0; a < 3; ++a) {
-                place[static_cast<int>(a)] =
-                    static_cast<double>(region.lo[a]) + spacing * static_cast<double>(at[a]);
-            }
-            light_[region.first + k] = computeLight(place);
-        });
-    });
-}
-
-/// The tabulated light, interpolated.
-LitPreview::Light LitPreview::lightAt(const Vec3d& local) const {
-    const auto entry = table_
-                           .find(static_cast<int64_t>(local[0]), static_cast<int64_t>(local[1]),
-                                 static_cast<int64_t>(local[2]))
-                           .entry;
-    if (entry == SparseTable::kEmpty) {
-        return {};
-    }
-    const Region& region = regions_[SparseTable::index(entry)];
-    const auto edge = static_cast<size_t>(region.cells + 1);
-    const size_t stride[3] = {edge * edge, edge, 1};
-    const double cellsPerVoxel = std::ldexp(static_cast<double>(region.cells), -region.shift);
-    size_t first = region.first;
-    float weight[3][2];
-    for (size_t a = 0; a < 3; ++a) {
-        const double x =
-            (local[static_cast<int>(a)] - static_cast<double>(region.lo[a])) * cellsPerVoxel;
-        const auto cell = std::min(static_cast<size_t>(std::max(x, 0.0)), edge - 2);
-        first += cell * stride[a];
-        weight[a][1] = static_cast<float>(x - static_cast<double>(cell));
-        weight[a][0] = 1 - weight[a][1];
-    }
-    Light light{};
-    for (size_t corner = 0; corner < 8; ++corner) {
-        const size_t x = corner >> 2;
-        const size_t y = corner >> 1 & 1;
-        const size_t z = corner & 1;
-        const float w = weight[0][x] * weight[1][y] * weight[2][z];
-        const Light& there = light_[first + x * stride[0] + y * stride[1] + z * stride[2]];
-        for (size_t k = 0; k < 3; ++k) {
-            light[k] += w * there[k];
-        }
-    }
-    return light;
-}
+    : volume_(openLevel(sidecarPath, options)), light_(volume_, options.sun) {}
 
 void LitPreview::drawPixel(const TrkRay& ray, double farDepth, Picture& picture,
                            size_t pixel) const {
-    constexpr double kOpaque = 1e-5;
-    Color radiance{};
-    Color transmittance{{1, 1, 1}};
-    double halfDepth = farDepth;
     trk::withVariant(volume_, trk::ControlKind::kConstant, [&](auto variant) {
         using V = decltype(variant);
         const auto clipped = volume_.clip(ray, volume_.field->box());
         if (!clipped) {
+            GatheredLight(0, 0, farDepth).write(picture, pixel);
             return;
         }
         const LocalRay& local = clipped->local;
-        const double lengthPerVoxel = clipped->lengthPerVoxel;
         // The clipped ray starts anew at the box.
         Vec3d entry = local.origin;
         for (int a = 0; a < 3; ++a) {
@@ -355,68 +181,31 @@ void LitPreview::drawPixel(const TrkRay& ray, double farDepth, Picture& picture,
         }
         const Vec3d eye{{static_cast<double>(ray.origin[0]), static_cast<double>(ray.origin[1]),
                          static_cast<double>(ray.origin[2])}};
-        const double start = length(volume_.indexToWorld.point(entry) - eye);
-        const auto mean = [](const Color& c) { return (c[0] + c[1] + c[2]) / 3; };
-        const auto densityAt = [&](const Vec3d& point) {
+        GatheredLight gathered(length(volume_.indexToWorld.point(entry) - eye),
+                               clipped->lengthPerVoxel, farDepth);
+        const auto densityAt = [&](double t) {
             double sum = 0;
-            for (const float d : volume_.field->density<V::kDensityChannels>(point)) {
+            for (const float d : volume_.field->density<V::kDensityChannels>(local.at(t))) {
                 sum += static_cast<double>(d);
             }
             return sum;
         };
-        // One stretch in which light counts as constant.
-        const auto addStretch = [&](double t0, double t1, const auto& passed) {
-            const Light light = lightAt(local.at(0.5 * (t0 + t1)));
-            const double before = mean(transmittance);
-            for (size_t k = 0; k < 3; ++k) {
-                const double p = passed[k % V::kChannels];
-                radiance[k] += transmittance[k] * (1 - p) * static_cast<double>(light[k]);
-                transmittance[k] *= p;
-            }
-            const double after = mean(transmittance);
-            if (before > 0.5 && after <= 0.5) {
-                const double within = std::log(before / 0.5) / std::log(before / after);
-                halfDepth = start + lengthPerVoxel * (t0 + within * (t1 - t0));
-            }
-        };
         volume_.field->forEachCell<V::kDensityChannels>(
             local, 0, local.tEnd, [&](double t0, double t1, const auto& integral) {
                 std::array<double, V::kChannels> depth;
-                double most = 0;
+                bool isEmpty = true;
                 for (size_t c = 0; c < V::kChannels; ++c) {
-                    depth[c] =
-                        lengthPerVoxel * volume_.scales[c] * integral[c % V::kDensityChannels];
-                    most = std::max(most, depth[c]);
+                    depth[c] = clipped->lengthPerVoxel * volume_.scales[c] *
+                               integral[c % V::kDensityChannels];
+                    isEmpty = isEmpty && depth[c] <= 0;
                 }
-                if (most == 0) {
-                    return true;
+                if (!isEmpty) {
+                    gatherCell(t0, t1, depth, densityAt, local, light_, gathered);
                 }
-                const auto count = stretchCount(t1 - t0, most);
-                // Of one stretch, nobody asks where in it.
-                const DepthInCell depthIn([&](double s) {
-                    return count > 1 ? densityAt(local.at(t0 + s * (t1 - t0))) : 0.0;
-                });
-                double from = 0;  // shares of the length, and of the depth
-                double depthFrom = 0;
-                for (int i = 1; i <= count; ++i) {
-                    const double to = static_cast<double>(i) / count;
-                    const double depthTo = i == count ? 1 : depthIn.share(to);
-                    std::array<double, V::kChannels> passed;
-                    for (size_t c = 0; c < V::kChannels; ++c) {
-                        passed[c] = std::exp(-depth[c] * std::max(depthTo - depthFrom, 0.0));
-                    }
-                    addStretch(t0 + from * (t1 - t0), t0 + to * (t1 - t0), passed);
-                    from = to;
-                    depthFrom = depthTo;
-                }
-                return std::max({transmittance[0], transmittance[1], transmittance[2]}) > kOpaque;
+                return isEmpty || gathered.isOpen();
             });
+        gathered.write(picture, pixel);
     });
-    for (size_t k = 0; k < 3; ++k) {
-        picture.transmittance[k][pixel] = static_cast<float>(transmittance[k]);
-        picture.light[k][pixel] = static_cast<float>(radiance[k]);
-    }
-    picture.halfDepth[pixel] = static_cast<float>(halfDepth);
 }
 
 WorldBox LitPreview::box() const {

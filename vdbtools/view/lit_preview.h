@@ -3,7 +3,7 @@
 #pragma once
 
 #include "camera.h"
-#include "field/sparse_table.h"
+#include "light_table.h"
 #include "volume.h"
 
 #include <array>
@@ -37,10 +37,7 @@ struct LitOptions {
     std::optional<uint32_t> level;
     float scale = 1;
     std::array<float, 3> color{{1, 1, 1}};
-    UpAxis up = UpAxis::kY;
-    /// Of the sun, in degrees: from the front towards +x, and above the horizon.
-    double azimuth = -29;
-    double elevation = 41;
+    Sun sun;
 };
 
 /// A level of a sidecar, lit. Control values are interpolated between the centres of super-voxels
@@ -64,42 +61,14 @@ class LitPreview {
     /// Which pixels of a picture meet anything.
     std::vector<char> hits(const Camera& camera, int width, int height) const;
 
-    size_t bytes() const {
-        return volume_.bytes() + table_.bytes() + regions_.capacity() * sizeof(Region) +
-               light_.capacity() * sizeof(Light);
-    }
+    size_t bytes() const { return volume_.bytes() + light_.bytes(); }
 
   private:
-    using Light = std::array<float, 3>;
-
-    /// Light from one direction.
-    struct Source {
-        trk::Vec3d towards;  ///< world space
-        trk::Vec3d offset;   ///< index space, of where its shadow is looked for
-        std::array<double, 3> radiance;
-    };
-
-    /// A brick of the field, or a constant region: light is tabulated at (cells + 1)^3 places.
-    struct Region {
-        trk::Int3 lo;
-        int shift;
-        trk::SparseTable::Entry entry;  // the field's
-        int64_t cells;                  // an edge
-        size_t first;                   // place, in light_; x slowest
-    };
-
-    static std::vector<Source> makeSources(const LitOptions& options);
-    Light computeLight(const trk::Vec3d& local) const;
-    Light lightAt(const trk::Vec3d& local) const;
-    void tabulateLight();
     void drawPixel(const TrkRay& ray, double farDepth, Picture& picture, size_t pixel) const;
     double farSide(const Camera& camera) const;
 
-    std::vector<Source> sources_;
-    trk::Volume volume_;      // the interpolated control, as if it were a density
-    trk::SparseTable table_;  // to regions_
-    std::vector<Region> regions_;
-    std::vector<Light> light_;  // what arrives at their places
+    trk::Volume volume_;  // the interpolated control, as if it were a density
+    LightTable light_;
 };
 
 }  // namespace vdbtools

@@ -8,7 +8,7 @@
 
 namespace trk {
 
-/// Room for an object of which most queries of one ray make none, or few of many.
+/// Room for an object that may never be made: in arrays of which a single ray fills little.
 template <class T>
 union Room {
     static_assert(std::is_trivially_destructible_v<T>);

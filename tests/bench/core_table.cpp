@@ -2,8 +2,9 @@
 // What the tracking core takes, and what it gains over what renderers do today (baselines.h), all
 // in one run on one pinned core: core_table FOLDER [FILTER]. Three procedural volumes, made into
 // FOLDER where they are not there yet, camera and secondary rays, mean depths of 1, 10 and 100;
-// then adversarial fields, and what calls, colour and two cores cost. FILTER: part of the names of
-// the sets to run, as "large/camera/1". Writes FOLDER/core.csv, and Markdown tables to stdout.
+// then adversarial fields, and what colour, samples, calls and two cores cost. FILTER: part of the
+// names of the sets to run, as "large/camera/1". Writes FOLDER/core.csv, and Markdown tables to
+// stdout.
 //
 // Contestants take turns; times are medians over rounds of this thread's CPU time, variances mean
 // squared errors against exact integration, over rays that hit.
@@ -301,6 +302,36 @@ void printColour(const Set& set) {
     std::fflush(stdout);
 }
 
+/// Sixteen samples of a ray, which share what it crosses and its plan, over sixteen times one.
+void printSamples(const Set& set) {
+    std::map<TrkControlKind, track::Volume> volumes;
+    for (const TrkControlKind kind : {TRK_CONTROL_CONSTANT, TRK_CONTROL_AFFINE}) {
+        track::Volume volume = set.field.open(set.scale);
+        TrkBakeOptions bake = trkDefaultBakeOptions();
+        bake.superVoxelSize = kind == TRK_CONTROL_AFFINE ? 4 : 16;
+        bake.control = kind;
+        volume.bake(bake);
+        volumes.emplace(kind, std::move(volume));
+    }
+    std::printf("| %s |", set.name.c_str());
+    std::vector<float> out(set.rays.size());
+    constexpr uint32_t kSamples = 16;
+    for (const FixedWay& way : {kWays[5], kWays[7], kWays[1], kWays[2]}) {
+        const auto estimate = [&](uint32_t samples) {
+            track::Query query = queryOf(way, 0);
+            query.samples = samples;
+            volumes.at(way.kind).estimateTransmittance(query, set.rays.data(), set.rays.size(),
+                                                       out.data());
+        };
+        const std::vector<double> times =
+            timesOf({[&] { estimate(1); }, [&] { estimate(kSamples); }}, threadSeconds);
+        std::printf(" %.0f | %.2f |", 1e9 * times[0] / static_cast<double>(set.rays.size()),
+                    times[1] / (kSamples * times[0]));
+    }
+    std::printf("\n");
+    std::fflush(stdout);
+}
+
 /// Single rays, rays that miss, and two cores.
 void printCalls(const Set& set) {
     TrkVolumeOptions options = trkDefaultVolumeOptions();
@@ -465,6 +496,13 @@ int main(int argc, char** argv) {
         if (set.name.find("/1") == set.name.size() - 2) {
             printColour(set);
         }
+    }
+    std::printf(
+        "\n| set | constant 16, one sample, ns a ray | a sample of sixteen over it | affine 4 | | "
+        "ratio 16 | | delta 16 | |\n"
+        "|---|---|---|---|---|---|---|---|---|\n");
+    for (const Set& set : sets) {
+        printSamples(set);
     }
     std::printf(
         "\n| set | (a), ns a ray | constant 16 in a batch, ns a ray | ray by ray over "

@@ -14,6 +14,8 @@
 #include <array>
 #include <cstddef>
 #include <cstdint>
+#include <random>
+#include <string>
 #include <vector>
 
 namespace {
@@ -23,8 +25,8 @@ using trk::ControlKind;
 using trk::Rng;
 using trk::Volume;
 
-Volume open(ControlKind kind, float scale, const std::array<float, 3>& color) {
-    const std::string vdb = fixtures::cloudFile(40);
+Volume open(const std::string& vdb, ControlKind kind, float scale,
+            const std::array<float, 3>& color) {
     const std::string sidecar = fixtures::path("flight.track.vdb");
     fixtures::bake(vdb, sidecar, 4, 0, kind);
     trk::VolumeOptions options;
@@ -32,6 +34,20 @@ Volume open(ControlKind kind, float scale, const std::array<float, 3>& color) {
     options.color = color;
     options.kernel = trk::Kernel::kBaseline;  // which is what this file is compiled for
     return trk::openVolume(vdb.c_str(), sidecar.c_str(), options);
+}
+
+/// Three channels that are not alike: holes, homogeneous blocks, and a gentle slope.
+std::string coloured() {
+    std::mt19937 random(5);
+    std::uniform_real_distribution<float> noise(0, 1);
+    return fixtures::write(
+        "flight_rgb.vdb",
+        {fixtures::makeColorGrid(
+            openvdb::CoordBBox(0, 0, 0, 95, 95, 95), [&](const openvdb::Coord& p) {
+                const float hole = noise(random) < 0.5f ? 0.0f : noise(random);
+                const auto block = static_cast<float>((p[0] >> 3) + (p[1] >> 3) + (p[2] >> 3));
+                return openvdb::Vec3f(hole, 0.02f * block, 0.002f * static_cast<float>(p[2]));
+            })});
 }
 
 /// The mean of `samples` walks of one ray, each with a plan of its own.
@@ -64,11 +80,11 @@ trk::Estimate<V::kChannels> walkAlone(const Volume& volume, const TrkQuery& quer
 }
 
 template <class V>
-void expectTheSame(const Volume& volume, TrkMethod method) {
+void expectTheSame(const Volume& volume, TrkMethod method, size_t rayCount = 60) {
     constexpr size_t C = V::kChannels;
     rays::Box box{};
     trk::worldBounds(volume.indexToWorld, volume.anchor, volume.field->box(), box.lo, box.hi);
-    const std::vector<TrkRay> rays = rays::through(box, 60, 20, 3);
+    const std::vector<TrkRay> rays = rays::through(box, rayCount, 20, 3);
     for (const uint32_t samples : {1u, 2u, 3u, 7u, 16u, 37u}) {
         TrkQuery query = trkDefaultQuery();
         query.rayStride = sizeof(TrkRay);
@@ -106,15 +122,21 @@ void expectTheSame(const Volume& volume, TrkMethod method) {
 
 TEST(Flight, SamplesThatShareAPlanAreThoseOfEachAlone) {
     constexpr ControlKind kConstant = ControlKind::kConstant;
+    const std::string cloud = fixtures::cloudFile(40);
+    const std::string rgb = coloured();
     for (const float scale : {0.2f, 20.0f}) {
-        const Volume grey = open(kConstant, scale, {{1, 1, 1}});
-        const Volume coloured = open(kConstant, scale, {{1, 0.5f, 0.1f}});
+        const Volume grey = open(cloud, kConstant, scale, {{1, 1, 1}});
+        const Volume coloured = open(cloud, kConstant, scale, {{1, 0.5f, 0.1f}});
         for (const TrkMethod method : {TRK_METHOD_RESIDUAL, TRK_METHOD_RATIO, TRK_METHOD_DELTA}) {
             expectTheSame<trk::Variant<1, 1, kConstant>>(grey, method);
             expectTheSame<trk::Variant<1, 3, kConstant>>(coloured, method);
         }
+        const Volume vectors = open(rgb, kConstant, scale, {{1, 1, 1}});
+        for (const TrkMethod method : {TRK_METHOD_RESIDUAL, TRK_METHOD_RATIO, TRK_METHOD_DELTA}) {
+            expectTheSame<trk::Variant<3, 3, kConstant>>(vectors, method, 300);
+        }
         expectTheSame<trk::Variant<1, 1, ControlKind::kAffine>>(
-            open(ControlKind::kAffine, scale, {{1, 1, 1}}), TRK_METHOD_RESIDUAL);
+            open(cloud, ControlKind::kAffine, scale, {{1, 1, 1}}), TRK_METHOD_RESIDUAL);
     }
 }
 

@@ -304,7 +304,7 @@ TEST(Preview, TheSunIsWhereItIsSaidToBe) {
     for (const auto up : {vdbtools::UpAxis::kY, vdbtools::UpAxis::kZ}) {
         for (const double azimuth : {0.0, 90.0, 200.0}) {
             vdbtools::LitOptions options = litOptions(0, 5);
-            options.up = up;
+            options.sun.up = up;
             options.sun.azimuth = azimuth;
             options.sun.elevation = 20;
             const LitPreview lit(sidecar, options);

@@ -113,8 +113,13 @@ class RatioWalk {
           cost_(cost),
           distance_(random.exponential()) {}
 
-    /// Into what the plan has crossed.
-    void enter() { at_ = 0; }
+    /// Into what the plan has crossed since it waits.
+    void enter() {
+        at_ = 0;
+        if (state_ == State::kWaits) {
+            state_ = State::kWeighs;
+        }
+    }
     /// What a walk came to.
     enum class State {
         kWeighs,  ///< collisions were drawn and are to be weighed
@@ -123,8 +128,7 @@ class RatioWalk {
     };
     /// Up to where it cannot go on by itself.
     State advance() {
-        if (state_ != State::kEnded) {
-            state_ = State::kWeighs;
+        if (state_ == State::kWeighs) {
             while (count_ < kChunk && (isInside_ || enterNext())) {
                 collideOrLeave();
             }
@@ -140,7 +144,7 @@ class RatioWalk {
         }
     }
 
-    /// Looks the collisions up.
+    /// Looks the collisions up; of a walk that waits, only where the plan is at the end of the ray.
     void weigh() {
         for (size_t i = 0; i < count_; ++i) {
             const Collision& collision = collisions_[i];

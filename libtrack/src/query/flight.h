@@ -82,10 +82,10 @@ class Flight {
         Walk walk;
     };
 
-    /// As many samples of each of the first rays.
-    void track(size_t rays, size_t firstSample, size_t samples) {
+    /// `samples` samples, from one on, of each ray in the first lanes.
+    void track(size_t lanes, size_t firstSample, size_t samples) {
         size_t going[kRays];
-        for (size_t k = 0; k < rays; ++k) {
+        for (size_t k = 0; k < lanes; ++k) {
             Lane& lane = lanes_[k].object;
             lane.plan.emplace(superVoxels_, lane.clipped.local, lane.settings);
             lane.isAtEnd = false;
@@ -97,19 +97,21 @@ class Flight {
             }
             going[k] = k;
         }
-        for (size_t count = rays; count > 0;) {
+        for (size_t count = lanes; count > 0;) {
             size_t kept = 0;
             for (size_t k = 0; k < count; ++k) {
                 Lane& lane = lanes_[going[k]].object;
                 Room<Sample>* its = samples_ + going[k] * samples;
                 if (advance(lane, its, samples)) {
                     going[kept++] = going[k];
-                    for (size_t s = 0; s < samples; ++s) {
-                        its[s].object.walk.prefetch();
-                    }
                 }
             }
             count = kept;
+            for (size_t k = 0; k < count; ++k) {
+                for (size_t s = 0; s < samples; ++s) {
+                    samples_[going[k] * samples + s].object.walk.prefetch();
+                }
+            }
             kept = 0;
             for (size_t k = 0; k < count; ++k) {
                 const Lane& lane = lanes_[going[k]].object;
@@ -124,14 +126,15 @@ class Flight {
             }
             count = kept;
         }
-        for (size_t k = 0; k < rays; ++k) {
+        for (size_t k = 0; k < lanes; ++k) {
             for (size_t s = 0; s < samples; ++s) {
                 lanes_[k].object.mean.add(samples_[k * samples + s].object.walk.result());
             }
         }
     }
-    /// Until every walk of a ray has something to weigh, or waits for one that has; false where all
-    /// have ended. What is weighed when is each walk's own affair, whoever flies with it.
+    /// Until a walk of a ray has something to weigh, for which the others wait, or the ray is at
+    /// its end; false where all walks have ended. What a walk draws and weighs is the same whoever
+    /// flies with it.
     bool advance(Lane& lane, Room<Sample>* its, size_t samples) {
         for (;;) {
             bool isWeighing = false;

@@ -203,7 +203,7 @@ ordered_json jsonOf(const Report& report) {
     json["active_voxels"] = report.source.summary.activeVoxels;
     json["box"] = ordered_json::array();
     const trk::IntBox& box = report.source.field->box();
-    for (int axis = 0; axis < 3; ++axis) {
+    for (size_t axis = 0; axis < 3; ++axis) {
         json["box"].push_back(box.hi[axis] - box.lo[axis]);
     }
     json["seconds"] = report.seconds;

@@ -239,11 +239,11 @@ track::Query queryOf(const Arguments& arguments) {
         }
     };
     const trk::MethodTraits& traits = trk::traitsOf(query.method);
-    const bool tracksRatios = !freePaths && traits.usesRoulette;
+    const bool tracksRatios = !freePaths && traits.usesRate && traits.usesRoulette;
     const bool tracks = freePaths || traits.usesRate;
     const bool isRandom = freePaths || traits.isRandom;
     needs("level", traits.hasLevels(), "only control has levels");
-    needs("step", traits.usesSteps(), "only march takes steps");
+    needs("step", traits.usesSteps(), "only march and comb take steps");
     needs("rate-base", tracksRatios, "only residual and ratio have one");
     needs("samples", isRandom && !freePaths,
           freePaths ? "each ray of the file gets one path" : "only random methods take samples");
@@ -253,7 +253,7 @@ track::Query queryOf(const Arguments& arguments) {
     needs("rate", tracks, "only residual, ratio, delta and free paths have one");
     needs("global", tracks, "only residual, ratio, delta and free paths walk over super-voxels");
     needs("choice", traits.usesChoice() && !freePaths, "only residual has one");
-    needs("roulette", tracksRatios, "only residual and ratio have one");
+    needs("roulette", !freePaths && traits.usesRoulette, "only residual, ratio and comb have one");
     needs("seed", isRandom, "nothing is random");
     needs("stream", isRandom, "nothing is random");
     if (arguments.flag("roulette") && arguments.has("error")) {
@@ -419,7 +419,9 @@ void run(const Command& command, const std::vector<std::string>& given) {
         "method", po::value<std::string>()->default_value("exact"),
         "exact: no noise, no bias; random and unbiased, as a renderer would ask: residual "
         "(residual "
-        "ratio tracking, least noise), ratio (ratio tracking), delta (delta tracking, 0 or 1); "
+        "ratio tracking, least noise), ratio (ratio tracking), delta (delta tracking, 0 or 1), "
+        "comb "
+        "(unbiased ray marching, next to exact and often faster); "
         "biased: control (the control alone, no noise), march (ray marching)")(
         "free-paths", po::bool_switch(),
         "sample where a photon collides instead, by --method residual (decomposition tracking, "
@@ -437,9 +439,9 @@ void run(const Command& command, const std::vector<std::string>& given) {
         "(>= 1)")("rate-base", po::value<std::string>()->default_value("majorant"),
                   "what the rate of residual and ratio is a multiple of, per super-voxel: majorant "
                   "or rms (of the residual)")("step", po::value<float>()->default_value(1.0f, "1"),
-                                              "of march: voxels between look-ups")(
+                                              "of march and comb: voxels between look-ups")(
         "roulette", po::bool_switch(),
-        "end walks of residual and ratio early, without bias, as renderers do: then standard "
+        "end walks of residual, ratio and comb early, without bias, as renderers do: then standard "
         "errors "
         "are those that the samples show, and empty where they show none")(
         "choice", po::value<std::string>()->default_value("robust"),

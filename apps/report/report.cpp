@@ -45,8 +45,7 @@ ordered_json fieldsOf(const Report& report, const SweepRow& row) {
     fields["size"] = !way.usesSuperVoxels()          ? ordered_json(nullptr)
                      : way.size == Way::kWholeVolume ? ordered_json("all")
                                                      : ordered_json(way.size);
-    fields["rate"] =
-        way.isRandom() && way.usesSuperVoxels() ? ordered_json(way.rate) : ordered_json(nullptr);
+    fields["rate"] = way.traits().usesRate ? ordered_json(way.rate) : ordered_json(nullptr);
     fields["step"] = way.traits().usesSteps() ? ordered_json(way.rate) : ordered_json(nullptr);
     fields["time_ns"] = number(row.nanoseconds);
     fields["time_spread"] = number(row.spread);

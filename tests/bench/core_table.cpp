@@ -2,9 +2,9 @@
 // What the tracking core takes, and what it gains over what renderers do today (baselines.h), all
 // in one run on one pinned core: core_table FOLDER [FILTER]. Three procedural volumes, made into
 // FOLDER where they are not there yet, camera and secondary rays, mean depths of 1, 10 and 100;
-// then adversarial fields, and what colour, samples, calls and two cores cost. FILTER: part of the
-// names of the sets to run, as "large/camera/1". Writes FOLDER/core.csv, and Markdown tables to
-// stdout.
+// then adversarial fields, and what colour, combs, samples, calls and two cores cost. FILTER: part
+// of the names of the sets to run, as "large/camera/1". Writes FOLDER/core.csv, and Markdown tables
+// to stdout.
 //
 // Contestants take turns; times are medians over rounds of this thread's CPU time, variances mean
 // squared errors against exact integration, over rays that hit.
@@ -302,6 +302,39 @@ void printColour(const Set& set) {
     std::fflush(stdout);
 }
 
+/// Combs, which are none of the fixed ways: RMS errors, and times over exact integration.
+void printCombs(const Set& set) {
+    track::Volume volume = set.field.open(set.scale);
+    volume.bake();
+    std::printf("| %s |", set.name.c_str());
+    std::vector<float> out(set.rays.size());
+    const auto estimate = [&](TrkMethod method, float step, uint64_t seed) {
+        track::Query query(seed, 0);
+        query.method = method;
+        query.step = step;
+        query.threads = 1;
+        volume.estimateTransmittance(query, set.rays.data(), set.rays.size(), out.data());
+    };
+    for (const float step : {1.0f, 2.0f, 4.0f}) {
+        uint64_t seed = 0;
+        double squares = 0;
+        const std::vector<double> times =
+            timesOf({[&] { estimate(TRK_METHOD_EXACT, 1, 0); },
+                     [&] {
+                         estimate(TRK_METHOD_COMB, step, seed++);
+                         for (size_t i = 0; i < out.size(); ++i) {
+                             const double error = static_cast<double>(out[i]) - set.exact[i];
+                             squares += error * error;
+                         }
+                     }},
+                    threadSeconds);
+        std::printf(" %.2f | %.2g |", times[1] / times[0],
+                    std::sqrt(squares / static_cast<double>(kRounds * out.size())));
+    }
+    std::printf("\n");
+    std::fflush(stdout);
+}
+
 /// Sixteen samples of a ray, which share what it crosses and its plan, over sixteen times one.
 void printSamples(const Set& set) {
     std::map<TrkControlKind, track::Volume> volumes;
@@ -496,6 +529,12 @@ int main(int argc, char** argv) {
         if (set.name.find("/1") == set.name.size() - 2) {
             printColour(set);
         }
+    }
+    std::printf(
+        "\n| set | comb of step 1 over exact, time | RMS error | step 2 | | step 4 | |\n"
+        "|---|---|---|---|---|---|---|\n");
+    for (const Set& set : sets) {
+        printCombs(set);
     }
     std::printf(
         "\n| set | constant 16, one sample, ns a ray | a sample of sixteen over it | affine 4 | | "

@@ -380,7 +380,8 @@ TEST(Api, TheThinnestDensitiesHaveNoErrorThatIsKnown) {
     const std::vector<TrkRay> all = cloudRays(volume, 100);
     std::vector<float> out(all.size());
     track::Statistics statistics(all.size(), 1);
-    for (const TrkMethod method : {TRK_METHOD_RATIO, TRK_METHOD_RESIDUAL, TRK_METHOD_DELTA}) {
+    for (const TrkMethod method :
+         {TRK_METHOD_RATIO, TRK_METHOD_RESIDUAL, TRK_METHOD_DELTA, TRK_METHOD_COMB}) {
         track::Query query(0, 0);
         query.method = method;
         query.samples = 4;

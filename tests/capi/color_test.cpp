@@ -18,7 +18,7 @@ using openvdb::Vec3f;
 using trk::ControlKind;
 
 const std::vector<TrkMethod> kMethods{TRK_METHOD_EXACT, TRK_METHOD_RESIDUAL, TRK_METHOD_RATIO,
-                                      TRK_METHOD_CONTROL};
+                                      TRK_METHOD_COMB, TRK_METHOD_CONTROL};
 
 struct Files {
     std::string vdb;

@@ -173,8 +173,9 @@ TEST(Coverage, NoErrorIsZeroUnlessTheResultIsExact) {
         options.scale = scene.options.scale;
         options.gridName = "density";
         const track::Volume volume = track::Volume::open(grid.vdb, scene.sidecar.c_str(), options);
-        for (const TrkMethod method : {TRK_METHOD_EXACT, TRK_METHOD_RESIDUAL, TRK_METHOD_RATIO,
-                                       TRK_METHOD_DELTA, TRK_METHOD_CONTROL, TRK_METHOD_MARCH}) {
+        for (const TrkMethod method :
+             {TRK_METHOD_EXACT, TRK_METHOD_RESIDUAL, TRK_METHOD_RATIO, TRK_METHOD_DELTA,
+              TRK_METHOD_CONTROL, TRK_METHOD_MARCH, TRK_METHOD_COMB}) {
             for (const uint32_t samples : {1u, 2u, 16u}) {
                 for (const uint32_t flags : {0u, 1u, 2u, 3u}) {
                     track::Query query(0, 0);

@@ -27,11 +27,11 @@ SweepOptions smallSweep() {
     options.color = {{1, 0.5f, 0}};
     options.rounds = fixtures::kSanitized ? 16 : 64;
     options.rayCount = 300;
-    options.ways =
-        vdbtools::sweepWays({TRK_METHOD_EXACT, TRK_METHOD_RESIDUAL, TRK_METHOD_RATIO,
-                             TRK_METHOD_CONTROL, TRK_METHOD_DELTA, TRK_METHOD_MARCH},
-                            {ControlKind::kConstant, ControlKind::kAffine, ControlKind::kTrilinear},
-                            {TRK_CHOICE_ROBUST, TRK_CHOICE_MIN}, {8, Way::kWholeVolume}, {1, 4});
+    options.ways = vdbtools::sweepWays(
+        {TRK_METHOD_EXACT, TRK_METHOD_RESIDUAL, TRK_METHOD_RATIO, TRK_METHOD_CONTROL,
+         TRK_METHOD_DELTA, TRK_METHOD_MARCH, TRK_METHOD_COMB},
+        {ControlKind::kConstant, ControlKind::kAffine, ControlKind::kTrilinear},
+        {TRK_CHOICE_ROBUST, TRK_CHOICE_MIN}, {8, Way::kWholeVolume}, {1, 4});
     return options;
 }
 

@@ -1,8 +1,8 @@
 // SPDX-License-Identifier: Apache-2.0
 // Densities too large for memory: baked and verified a page at a time, to the same bits.
 #include "bake/bake.h"
-#include "bake/write_bake.h"
 #include "bake/verify.h"
+#include "bake/write_bake.h"
 #include "failure.h"
 #include "field/table_builder.h"
 #include "io/density.h"

@@ -4,8 +4,8 @@
 #include "field/table_builder.h"
 
 #include "bake/bake.h"
-#include "bake/write_bake.h"
 #include "bake/verify.h"
+#include "bake/write_bake.h"
 #include "failure.h"
 #include "io/vdb_file.h"
 #include "support/fixtures.h"

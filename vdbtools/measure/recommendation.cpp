@@ -99,7 +99,7 @@ std::string queryOptionsOf(const Way& way) {
     if (way.rate != 1) {
         char rate[32];
         std::snprintf(rate, sizeof(rate), "%.9g", way.rate);
-        options += std::string(" --rate ") + rate;
+        options += (way.traits().usesSteps() ? " --step " : " --rate ") + std::string(rate);
     }
     return options;
 }

@@ -241,7 +241,7 @@ class SetRun {
             }
             return sum;
         }
-        if (!way.traits().usesRoulette) {
+        if (!way.traits().usesRate) {
             sum.fill(way.isRandom() ? kNaN : 0.0);
             return sum;
         }

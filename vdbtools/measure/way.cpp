@@ -41,6 +41,7 @@ std::vector<Way> sweepWays(const std::vector<TrkMethod>& methods,
                            const std::vector<ControlKind>& kinds,
                            const std::vector<TrkChoice>& choices, const std::vector<int>& sizes,
                            const std::vector<double>& rates) {
+    const std::vector<double> steps{1, 4};
     std::vector<Way> ways;
     const auto add = [&](const Way& way) {
         if (std::find(ways.begin(), ways.end(), way) == ways.end()) {
@@ -51,7 +52,7 @@ std::vector<Way> sweepWays(const std::vector<TrkMethod>& methods,
         Way way;
         way.method = method;
         if (!way.usesSuperVoxels()) {
-            for (const double step : {1.0, 4.0}) {
+            for (const double step : steps) {
                 way.rate = way.traits().usesSteps() ? step : 1;
                 add(way);
             }
@@ -76,7 +77,7 @@ std::vector<Way> sweepWays(const std::vector<TrkMethod>& methods,
                         continue;
                     }
                     way.choice = way.usesControl() ? choice : TrkChoice{TRK_CHOICE_ROBUST};
-                    for (const double rate : rates) {
+                    for (const double rate : way.traits().usesSteps() ? steps : rates) {
                         // A looser majorant only costs delta tracking time.
                         way.rate = way.traits().usesRoulette ? rate : 1;
                         add(way);

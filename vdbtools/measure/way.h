@@ -17,7 +17,7 @@ struct Way {
     trk::ControlKind kind = trk::ControlKind::kConstant;
     TrkChoice choice = TRK_CHOICE_ROBUST;
     int size = 0;     ///< of super-voxels, in voxels; kWholeVolume: one over everything
-    double rate = 1;  ///< of residual, ratio and delta; of march: voxels a step
+    double rate = 1;  ///< of residual, ratio and delta; of march and comb: voxels a step
 
     static constexpr int kWholeVolume = -1;
 

@@ -41,6 +41,7 @@ const kFamilies = [
       title: `residual, ${kind}`, color, shape, holds: r => r.method === 'residual' && r.control === kind
     })),
   { title: 'control (biased)', color: '#2ca02c', shape: 'box', holds: r => r.method === 'control' },
+  { title: 'comb', color: '#17becf', shape: 'square', holds: r => r.method === 'comb' },
   { title: 'march (biased)', color: '#8c564b', shape: 'plus', holds: r => r.method === 'march' }
 ];
 

@@ -90,8 +90,10 @@ enum {
     TRK_METHOD_RATIO = 2,    /**< ratio tracking, unbiased; needs a sidecar [Novak14] */
     TRK_METHOD_CONTROL = 3,  /**< the baked control alone: biased, no noise, for level of detail */
     TRK_METHOD_DELTA = 4,    /**< delta tracking: unbiased, 0 or 1, most noise; needs a sidecar */
-    TRK_METHOD_MARCH = 5 /**< ray marching from a random offset: biased, noise where steps are long;
-                              the density alone */
+    TRK_METHOD_MARCH = 5,    /**< ray marching from a random offset: biased, noise where steps are
+                                  long; the density alone */
+    TRK_METHOD_COMB = 6 /**< unbiased ray marching: little noise, for less than exact integration;
+                             needs a sidecar [Kettunen21] */
 };
 
 /** The control of the residual method, chosen per super-voxel when a volume is opened. Sidecars
@@ -320,13 +322,14 @@ typedef struct TrkQuery {
                                is unbiased. Of delta and free paths it multiplies the majorant, and
                                must be >= 1 */
     TrkRateBase rateBase; /**< of residual and ratio. Experimental */
-    float step;           /**< of TRK_METHOD_MARCH: voxel lengths between look-ups; >= 0.001 */
-    uint32_t level;       /**< of TRK_METHOD_CONTROL: 0 the baked super-voxels, k 2^k larger ones */
-    uint32_t flags;       /**< TRK_QUERY_… bits */
-    int32_t threads;      /**< 0: all, 1: the calling thread alone, n: at most n */
-    uint64_t seed;        /**< of the random numbers */
-    uint64_t stream;      /**< see above */
-    uint64_t firstRayId;  /**< ray i has id firstRayId + i, unless rayIds is given */
+    float step;      /**< of TRK_METHOD_MARCH and TRK_METHOD_COMB: voxel lengths between look-ups;
+                          >= 0.001 */
+    uint32_t level;  /**< of TRK_METHOD_CONTROL: 0 the baked super-voxels, k 2^k larger ones */
+    uint32_t flags;  /**< TRK_QUERY_… bits */
+    int32_t threads; /**< 0: all, 1: the calling thread alone, n: at most n */
+    uint64_t seed;   /**< of the random numbers */
+    uint64_t stream; /**< see above */
+    uint64_t firstRayId;    /**< ray i has id firstRayId + i, unless rayIds is given */
     const uint64_t* rayIds; /**< one id a ray, or NULL */
     size_t rayStride;       /**< bytes from one TrkRay to the next; 0: sizeof(TrkRay) */
     size_t resultStride;    /**< bytes from one ray's transmittance or optical depth to the next

@@ -28,7 +28,7 @@ struct MethodTraits {
 };
 
 /// One row a method, in the order of their numbers.
-inline constexpr std::array<MethodTraits, 6> kMethods{{
+inline constexpr std::array<MethodTraits, 7> kMethods{{
     // clang-format off
     //                                                    random unbiased density super-voxels control rate roulette free paths
     {TRK_METHOD_EXACT,    "exact",    "TRK_METHOD_EXACT",    false, true,  true,  false, false, false, false, false},
@@ -37,6 +37,7 @@ inline constexpr std::array<MethodTraits, 6> kMethods{{
     {TRK_METHOD_CONTROL,  "control",  "TRK_METHOD_CONTROL",  false, false, false, true,  true,  false, false, false},
     {TRK_METHOD_DELTA,    "delta",    "TRK_METHOD_DELTA",    true,  true,  true,  true,  false, true,  false, true},
     {TRK_METHOD_MARCH,    "march",    "TRK_METHOD_MARCH",    true,  false, true,  false, false, false, false, false},
+    {TRK_METHOD_COMB,     "comb",     "TRK_METHOD_COMB",     true,  true,  true,  true,  false, false, true,  false},
     // clang-format on
 }};
 

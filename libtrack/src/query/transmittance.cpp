@@ -2,6 +2,7 @@
 #include "transmittance.h"
 
 #include "batch.h"
+#include "estimate/comb.h"
 #include "estimate/exact.h"
 #include "estimate/free_path.h"
 #include "estimate/ray_marching.h"
@@ -69,7 +70,7 @@ std::array<double, V::kChannels> deterministicDepth(const Volume& volume, const 
     return depth;
 }
 
-/// By a random method that takes one ray at a time: delta tracking and marching.
+/// By a random method that takes one ray at a time: delta tracking, marching and combs.
 template <class V>
 Estimate<V::kChannels> estimateRandomly(const Volume& volume, const TrkQuery& query,
                                         const ClippedRay& clipped, uint64_t rayId, PathCost& cost) {
@@ -88,6 +89,11 @@ Estimate<V::kChannels> estimateRandomly(const Volume& volume, const TrkQuery& qu
     }
     for (uint32_t i = 0; i < query.samples; ++i) {
         Rng rng(query.seed, query.stream, rayId, i);
+        if (query.method == TRK_METHOD_COMB) {
+            mean.add(combTransmittance(extinction, typename V::Walk(volume), ray, settings,
+                                       static_cast<double>(query.step), rng, cost));
+            continue;
+        }
         auto depth = marchOpticalDepth(extinction, ray, settings.lengthPerVoxel,
                                        static_cast<double>(query.step), rng, cost);
         for (double& value : depth) {
@@ -126,12 +132,12 @@ template <class V>
 void estimateRange(const Volume& volume, const TrkQuery& query, const TrkRay* rays, size_t begin,
                    size_t end, const RayOutput<V>& output) {
     const MethodTraits& method = traitsOf(query.method);
-    if (method.usesRoulette && method.usesControl) {
+    if (method.usesRate && method.usesControl) {
         Flight<V, Control::kChosen>(volume, query).estimate(rays, begin, end, output);
         return;
     }
     if constexpr (V::kKind == ControlKind::kConstant) {  // or none is looked at: see controlKind
-        if (method.usesRoulette) {
+        if (method.usesRate && method.usesRoulette) {
             Flight<V, Control::kNone>(volume, query).estimate(rays, begin, end, output);
             return;
         }

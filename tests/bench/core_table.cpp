@@ -15,12 +15,14 @@
 #include "track/track_openvdb.hpp"
 
 #include <sched.h>
+#include <tbb/task_arena.h>
 
 #include <algorithm>
 #include <array>
 #include <cmath>
 #include <cstdio>
 #include <cstring>
+#include <filesystem>
 #include <functional>
 #include <map>
 #include <string>
@@ -415,7 +417,11 @@ void printCalls(const Set& set) {
     for (int cpu = 0; cpu < CPU_SETSIZE; ++cpu) {
         CPU_SET(cpu, &all);
     }
-    sched_setaffinity(0, sizeof(all), &all);
+    onThreads(2);
+    // TBB's threads are pinned where they were started by one that was.
+    for (const auto& thread : std::filesystem::directory_iterator("/proc/self/task")) {
+        sched_setaffinity(std::stoi(thread.path().filename()), sizeof(all), &all);
+    }
     const std::vector<double> walls =
         timesOf({[&] { onThreads(1); }, [&] { onThreads(2); }}, wallSeconds);
     sched_setaffinity(0, sizeof(pinned), &pinned);
@@ -458,6 +464,7 @@ int main(int argc, char** argv) {
                                procedural(folder, source.kind, source.voxels));
         }
     }
+    tbb::this_task_arena::max_concurrency();  // which is all cores, if asked for in time
     cpu_set_t pinned;
     CPU_ZERO(&pinned);
     CPU_SET(static_cast<size_t>(sched_getcpu()), &pinned);

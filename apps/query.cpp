@@ -253,6 +253,7 @@ track::Query queryOf(const Arguments& arguments) {
     needs("rate", tracks, "only residual, ratio, delta and free paths have one");
     needs("global", tracks, "only residual, ratio, delta and free paths walk over super-voxels");
     needs("choice", traits.usesChoice() && !freePaths, "only residual has one");
+    needs("size", traits.usesSuperVoxels || freePaths, "it uses no super-voxels");
     needs("roulette", !freePaths && traits.usesRoulette, "only residual, ratio and comb have one");
     needs("seed", isRandom, "nothing is random");
     needs("stream", isRandom, "nothing is random");
@@ -305,6 +306,13 @@ TrkVolumeOptions volumeOptionsOf(const Arguments& arguments) {
     options.repair = repairBits(arguments);
     options.maxMemory = memoryLimit(arguments);
     options.gridName = arguments.has("grid") ? arguments.get<std::string>("grid").c_str() : nullptr;
+    if (arguments.has("size")) {
+        const int size = arguments.integer("size", 4, 64);
+        if ((size & (size - 1)) != 0) {
+            throw UsageError("--size: expected 4, 8, 16, 32 or 64");
+        }
+        options.superVoxelSize = static_cast<uint32_t>(size);
+    }
     options.kernel =
         arguments.has("kernel") ? arguments.get<std::string>("kernel").c_str() : nullptr;
     return options;
@@ -386,6 +394,7 @@ trk::Volume openInside(const Inputs& inputs) {
     options.global = inputs.options.global != 0;
     options.repair = inputs.options.repair;
     options.maxMemory = inputs.options.maxMemory;
+    options.superVoxelSize = static_cast<int>(inputs.options.superVoxelSize);
     if (inputs.options.kernel) {
         const std::string name = inputs.options.kernel;
         options.kernel = name == trk::kernelName(trk::Kernel::kAvx2) ? trk::Kernel::kAvx2
@@ -450,6 +459,8 @@ void run(const Command& command, const std::vector<std::string>& given) {
                            "take the whole volume for one super-voxel with a constant control: "
                            "for comparison")("level", po::value<int>()->default_value(0),
                                              "preview level of the control method")(
+        "size", po::value<int>(),
+        "larger super-voxels than were baked, made of those: up to 64; by default as baked")(
         "kernel", po::value<std::string>(),
         "baseline or avx2: whose code runs; by default the best of this processor")(
         "seed", po::value<uint64_t>()->default_value(0), "of the random numbers")(
@@ -499,7 +510,7 @@ const Command kQueryCommand{
     "vdbtrack query IN.vdb|SIDECAR --rays RAYS.csv [--sidecar S] [--grid NAME] [--method exact] "
     "[--free-paths] [--samples 64] [--error E] [--rate 1] [--rate-base majorant] [--step 1] "
     "[--roulette] "
-    "[--choice robust] [--global] [--level 0] [--seed 0] [--stream 0] [--scale 1] "
+    "[--choice robust] [--size N] [--global] [--level 0] [--seed 0] [--stream 0] [--scale 1] "
     "[--color 1,1,1] [-o OUT.csv] [--force]",
     "Prints the transmittance of rays: ray,transmittance,stderr,optical_depth,lookups; in colour "
     "with _r, _g, _b; empty where something is not known. With --free-paths, where photons "

@@ -52,6 +52,10 @@ constexpr size_t kFirstFreePaths = offsetof(TrkFreePaths, lookupsStride) + sizeo
 constexpr size_t kFirstBakeOptions = offsetof(TrkBakeOptions, progressData) + sizeof(void*);
 constexpr size_t kFirstDensity = offsetof(TrkDensity, tileActive) + sizeof(void*);
 
+bool isSuperVoxelSize(uint32_t size) {
+    return size >= 4 && size <= 64 && (size & (size - 1)) == 0;
+}
+
 void checkThreads(int32_t threads) {
     if (threads < 0) {
         refuse("threads is " + std::to_string(threads) + "; expected 0 (all) or more");
@@ -105,6 +109,14 @@ TrkVolumeOptions checkedOptions(const TrkVolumeOptions* given) {
         refuse("noBake is " + std::to_string(options.noBake) + "; expected 0 or 1");
     }
     kernelOf(options);
+    const uint32_t size = options.superVoxelSize;
+    if (size != 0 && !isSuperVoxelSize(size)) {
+        refuse("superVoxelSize is " + std::to_string(size) +
+               "; expected 4, 8, 16, 32 or 64, or 0: as baked");
+    }
+    if (options.reserved != 0) {
+        refuse("reserved is " + std::to_string(options.reserved) + "; expected 0");
+    }
     return options;
 }
 
@@ -121,6 +133,7 @@ VolumeOptions volumeOptions(const TrkVolumeOptions& options) {
     result.repair = options.repair;
     result.maxMemory = options.maxMemory;
     result.kernel = kernelOf(options);
+    result.superVoxelSize = static_cast<int>(options.superVoxelSize);
     return result;
 }
 
@@ -128,7 +141,7 @@ TrkBakeOptions checkedOptions(const TrkBakeOptions* given) {
     const TrkBakeOptions options =
         given ? completed(*given, "TrkBakeOptions", kFirstBakeOptions) : trkDefaultBakeOptions();
     const uint32_t size = options.superVoxelSize;
-    if (size < 4 || size > 64 || (size & (size - 1)) != 0) {
+    if (!isSuperVoxelSize(size)) {
         refuse("superVoxelSize is " + std::to_string(size) + "; expected 4, 8, 16, 32 or 64");
     }
     if (options.control < TRK_CONTROL_CONSTANT || options.control > TRK_CONTROL_AFFINE) {

@@ -2,6 +2,7 @@
 #include "volume.h"
 
 #include "bake/bake.h"
+#include "bake/coarser.h"
 #include "bake/write_bake.h"
 #include "failure.h"
 #include "io/density.h"
@@ -136,6 +137,24 @@ Volume makeVolume(const DensitySummary& summary, std::shared_ptr<const DensityFi
 
 void addSuperVoxels(Volume& volume, BakedVolume baked, const VolumeOptions& options,
                     const std::string& where) {
+    if (options.superVoxelSize > 0 && options.superVoxelSize != baked.superVoxelSize()) {
+        if (options.superVoxelSize < baked.superVoxelSize()) {
+            throw Error(TRK_ERROR_INVALID_ARGUMENT,
+                        where + ": super-voxels of " + std::to_string(options.superVoxelSize) +
+                            " are smaller than those it was baked with; expected " +
+                            std::to_string(baked.superVoxelSize()) + " or more");
+        }
+        if (baked.kind == ControlKind::kTrilinear) {
+            throw Error(TRK_ERROR_INVALID_ARGUMENT,
+                        where +
+                            ": its control is trilinear, of which no larger super-voxels "
+                            "follow; expected superVoxelSize 0 or " +
+                            std::to_string(baked.superVoxelSize()));
+        }
+        while (baked.superVoxelSize() < options.superVoxelSize) {
+            baked = coarser(baked);
+        }
+    }
     checkScale(volume.scales, "density", static_cast<double>(baked.maxDensity()), where);
     if (baked.kind != ControlKind::kConstant) {
         checkScale(volume.scales, "control (its value or slope)", baked.maxCoefficient(), where);
@@ -166,6 +185,9 @@ void bakeInMemory(Volume& volume, const VolumeOptions& options) {
     BakeOptions bakeOptions;
     bakeOptions.maxMemory = options.maxMemory;
     bakeOptions.gradients = false;
+    if (options.superVoxelSize > 0) {
+        bakeOptions.superVoxelSize = options.superVoxelSize;
+    }
     bakeOptions.where = volume.density->path;
     addSuperVoxels(volume, bake(*volume.field, bakeOptions), options, volume.density->path);
 }
@@ -190,10 +212,12 @@ Volume openVolume(const char* vdbPath, const char* sidecarPath, const VolumeOpti
     if (haveSidecar) {
         sidecar.header = readSidecarHeader(path);
     }
+    // Larger super-voxels follow from gradients too.
+    const SidecarParts parts =
+        options.superVoxelSize > 0 ? SidecarParts::kAll : SidecarParts::kQueries;
     Volume volume;
     if (vdbPath == nullptr) {
-        sidecar =
-            readSidecar(path, nullptr, options.check, SidecarParts::kQueries, options.maxMemory);
+        sidecar = readSidecar(path, nullptr, options.check, parts, options.maxMemory);
         volume.options = options;
         volume.grid = sidecar.header.source;
         if (options.gridNamed && options.gridName != volume.grid.name &&
@@ -221,8 +245,7 @@ Volume openVolume(const char* vdbPath, const char* sidecarPath, const VolumeOpti
             makeVolume(density.summary,
                        std::make_shared<const DensityField>(std::move(density.field)), options);
         if (haveSidecar) {
-            sidecar = readSidecar(path, &density.summary, options.check, SidecarParts::kQueries,
-                                  options.maxMemory);
+            sidecar = readSidecar(path, &density.summary, options.check, parts, options.maxMemory);
         }
     }
     volume.sidecarPath = path;
@@ -275,7 +298,9 @@ void bakeVolume(Volume& volume, BakeOptions options, const char* path, bool over
         writeBake(*file, *volume.density, *volume.field, baked, options.sidecarBytes);
         next.sidecarPath = path;
     }
-    addSuperVoxels(next, std::move(baked), volume.options, volume.density->path);
+    VolumeOptions asBaked = volume.options;
+    asBaked.superVoxelSize = 0;
+    addSuperVoxels(next, std::move(baked), asBaked, volume.density->path);
     checkMemory(next.bytes(), options.maxMemory, volume.density->path);
     if (file) {
         file->commit();

@@ -62,6 +62,7 @@ struct VolumeOptions {
     uint32_t repair = 0;
     uint64_t maxMemory = 0;
     Kernel kernel = kDefaultKernel;
+    int superVoxelSize = 0;  ///< that queries use, made of those baked; 0: as baked
 };
 
 struct Volume {

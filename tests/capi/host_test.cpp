@@ -163,7 +163,7 @@ TEST(Host, TheHeaderHasTheVersionOfTheLibrary) {
 
 // Padding would hold what happened to lie there, and a field of a later release could fall into it.
 TEST(Host, StructsAreFullOfFields) {
-    EXPECT_EQ(sizeof(TrkVolumeOptions), offsetof(TrkVolumeOptions, kernel) + sizeof(const char*));
+    EXPECT_EQ(sizeof(TrkVolumeOptions), offsetof(TrkVolumeOptions, reserved) + sizeof(uint32_t));
     EXPECT_EQ(sizeof(TrkBakeOptions), offsetof(TrkBakeOptions, progressData) + sizeof(void*));
     EXPECT_EQ(sizeof(TrkDensity), offsetof(TrkDensity, tileActive) + sizeof(void*));
     EXPECT_EQ(sizeof(TrkQuery), offsetof(TrkQuery, resultStride) + sizeof(size_t));
@@ -173,6 +173,30 @@ TEST(Host, StructsAreFullOfFields) {
     options.noBake = 2;
     TrkVolume* volume = nullptr;
     EXPECT_EQ(trkOpenVolume("x.vdb", "", &options, &volume), TRK_ERROR_INVALID_ARGUMENT);
+}
+
+TEST(Host, AVolumeHasSuperVoxelsOfTheSizeThatIsAskedFor) {
+    const std::string vdb = fixtures::cloudFile(64);
+    const std::string sidecar = fixtures::path("host_size.track.vdb");
+    fixtures::bake(vdb, sidecar, 8);
+    TrkVolumeOptions options = trkDefaultVolumeOptions();
+    EXPECT_EQ(track::Volume::open(vdb, sidecar.c_str(), options).info().superVoxelSize, 8u);
+    options.superVoxelSize = 32;
+    EXPECT_EQ(track::Volume::open(vdb, sidecar.c_str(), options).info().superVoxelSize, 32u);
+    EXPECT_EQ(track::Volume::open(vdb, "", options).info().superVoxelSize, 32u);
+    EXPECT_EQ(track::Volume::open("", sidecar.c_str(), options).info().superVoxelSize, 32u);
+    TrkVolume* volume = nullptr;
+    for (const uint32_t size : {1u, 4u, 12u, 128u}) {
+        options.superVoxelSize = size;
+        EXPECT_EQ(trkOpenVolume(vdb.c_str(), sidecar.c_str(), &options, &volume),
+                  TRK_ERROR_INVALID_ARGUMENT)
+            << size;
+        EXPECT_NE(std::string(trkGetLastErrorMessage()).find("expected"), std::string::npos);
+    }
+    options.superVoxelSize = 0;
+    options.reserved = 1;
+    EXPECT_EQ(trkOpenVolume(vdb.c_str(), sidecar.c_str(), &options, &volume),
+              TRK_ERROR_INVALID_ARGUMENT);
 }
 
 TEST(Host, AVolumeRunsTheKernelThatIsAskedFor) {

@@ -343,6 +343,15 @@ case_query_output() {
     expect 0 query cloud.vdb --rays rays.csv --method march --step 0.05
     paste -d, exact.csv stdout | awk -F, 'NR > 1 { d = $2 - $7; if (d < 0) d = -d
         if (d > 1e-3) { print; exit 1 } }' >bad || fail "march: $(cat bad)"
+    expect 0 query cloud.vdb --rays rays.csv --method comb --step 1 --samples 256 --roulette
+    paste -d, exact.csv stdout | awk -F, 'NR > 1 { d = $2 - $7; if (d < 0) d = -d
+        if (d > 1e-2) { print; exit 1 } }' >bad || fail "comb: $(cat bad)"
+    # Larger super-voxels of those in a sidecar, which are what larger ones of a bake are.
+    expect 0 bake cloud.vdb --size 8 --control affine -o sized.track.vdb --force
+    expect 0 query cloud.vdb --sidecar sized.track.vdb --size 16 --rays rays.csv --method residual
+    awk -F, 'NR > 1 && $3 == "" { exit 1 }' stdout || fail "--size: $(cat stdout)"
+    expect 1 query cloud.vdb --sidecar sized.track.vdb --size 4 --rays rays.csv --method residual
+    contains stderr "super-voxels of 4 are smaller than those it was baked with; expected 8 or more"
     # Too deep for a float, and random: the error is not 0.
     expect 0 query cloud.vdb --rays rays.csv --method delta --scale 1000
     awk -F, 'NR == 2 && !($2 == 0 && $3 > 0) { exit 1 }' stdout || fail "deep: $(cat stdout)"
@@ -414,6 +423,8 @@ case_free_paths() {
     wrong "--global: of no use with --method control" --method control --global
     wrong "--choice: of no use with --method ratio" --method ratio --choice min
     wrong "--choice: of no use with --free-paths" --free-paths --choice mean
+    wrong "--size: of no use with --method exact" --method exact --size 16
+    wrong "--size: expected 4, 8, 16, 32 or 64" --method ratio --size 12
     wrong "--roulette: of no use with --method delta" --method delta --roulette
     wrong "rate-base" --method ratio --rate-base loudest
 }

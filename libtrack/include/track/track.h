@@ -164,12 +164,16 @@ typedef struct TrkVolumeOptions {
                              memory, of the default TrkBakeOptions, for a part of what reading it
                              takes */
     uint64_t maxMemory; /**< refuse to hold more bytes than this; 0: no limit */
-    TrkProgress progress; /**< or NULL */
-    void* progressData;   /**< handed to it */
-    const char* kernel;   /**< whose code queries of the volume run: "avx2", or "baseline", which
-                             every processor has; NULL: the best of the processor, unless the
-                             environment variable TRACK_KERNEL says "baseline". Results have the
-                             same bits on one kernel, and differ in the last ones between two */
+    TrkProgress progress;    /**< or NULL */
+    void* progressData;      /**< handed to it */
+    const char* kernel;      /**< whose code queries of the volume run: "avx2", or "baseline", which
+                                every processor has; NULL: the best of the processor, unless the
+                                environment variable TRACK_KERNEL says "baseline". Results have the
+                                same bits on one kernel, and differ in the last ones between two */
+    uint32_t superVoxelSize; /**< larger super-voxels than were baked, made of those in
+                                  milliseconds: up to 64 voxels; 0: as baked. A bake in memory gets
+                                  this size. Not of a trilinear control */
+    uint32_t reserved;       /**< 0 */
 } TrkVolumeOptions;
 
 static inline TrkVolumeOptions trkDefaultVolumeOptions(void) {
@@ -188,6 +192,8 @@ static inline TrkVolumeOptions trkDefaultVolumeOptions(void) {
     options.progress = NULL;
     options.progressData = NULL;
     options.kernel = NULL;
+    options.superVoxelSize = 0;
+    options.reserved = 0;
     return options;
 }
 

@@ -25,8 +25,7 @@ constexpr auto kLargest = static_cast<double>(std::numeric_limits<float>::max())
 
 std::array<float, 3> fitGradient(const CornerMoments& moments, int size) {
     const double n = size;
-    // Mean over the vertices of (x - centre)^2, the trapezoid rule of its integral.
-    const double spread = n * n / 12 + 1.0 / 6;
+    const double spread = gradientSpread(n);
     std::array<float, 3> gradient{};
     for (size_t axis = 0; axis < 3; ++axis) {
         double difference = 0;

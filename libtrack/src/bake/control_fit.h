@@ -20,6 +20,12 @@ namespace trk {
 /// fit of a multilinear control asks.
 using CornerMoments = std::array<double, 8>;
 
+/// Mean over the vertices of a super-voxel of (x - centre)^2, along an axis, in voxels: the
+/// trapezoid rule of its integral.
+inline double gradientSpread(double size) {
+    return size * size / 12 + 1.0 / 6;
+}
+
 /// The gradient (density per voxel) that leaves the least squared residual around the mean.
 std::array<float, 3> fitGradient(const CornerMoments& moments, int size);
 

@@ -212,9 +212,11 @@ Volume openVolume(const char* vdbPath, const char* sidecarPath, const VolumeOpti
     if (haveSidecar) {
         sidecar.header = readSidecarHeader(path);
     }
-    // Larger super-voxels follow from gradients too.
-    const SidecarParts parts =
-        options.superVoxelSize > 0 ? SidecarParts::kAll : SidecarParts::kQueries;
+    // Larger super-voxels follow from gradients, which those of an affine control come with.
+    const bool isLarger = options.superVoxelSize > sidecar.header.superVoxelSize;
+    const SidecarParts parts = isLarger && sidecar.header.controlKind == ControlKind::kConstant
+                                   ? SidecarParts::kAll
+                                   : SidecarParts::kQueries;
     Volume volume;
     if (vdbPath == nullptr) {
         sidecar = readSidecar(path, nullptr, options.check, parts, options.maxMemory);

@@ -201,7 +201,7 @@ void run(const Command& command, const std::vector<std::string>& given) {
         "size", po::value<std::string>()->default_value("4,8,16,32,all"),
         "sizes of super-voxels; all: one over the whole volume")(
         "rate", po::value<std::string>()->default_value("1,4"),
-        "rates of residual and ratio; delta always has 1, march steps of 1 and 4")(
+        "rates of residual and ratio; delta always has 1, march and comb steps of 1 and 4")(
         "depth", po::value<std::string>()->default_value("1,10,100,own"),
         "mean optical depths of camera rays to scale the volume to, before the tint; own: "
         "--scale")("scale", po::value<float>()->default_value(1.0f, "1"),

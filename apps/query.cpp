@@ -107,7 +107,8 @@ void noteUnknown(const Unknown& unknown, const TrkQuery& query) {
         return;
     }
     if (query.samples == 1) {
-        std::cerr << "with --roulette, one sample shows none\n";
+        std::cerr << (method.usesRate ? "with --roulette, one sample shows none\n"
+                                      : "one sample shows none\n");
         return;
     }
     std::cerr << "all " << query.samples << " samples agree";
@@ -119,7 +120,7 @@ void noteUnknown(const Unknown& unknown, const TrkQuery& query) {
         std::cerr << "; no sample got through " << unknown.dark << " of them: T < " << bound
                   << " at 95 %";
     }
-    std::cerr << "; without --roulette all have one\n";
+    std::cerr << (method.usesRate ? "; without --roulette all have one\n" : "\n");
 }
 
 std::string table(const Arguments& arguments, size_t channels, const TrkQuery& query,
@@ -251,7 +252,8 @@ track::Query queryOf(const Arguments& arguments) {
           freePaths ? "paths have no variance to choose by"
                     : "only residual, ratio and delta have a variance to choose by");
     needs("rate", tracks, "only residual, ratio, delta and free paths have one");
-    needs("global", tracks, "only residual, ratio, delta and free paths walk over super-voxels");
+    needs("global", tracks || (traits.isRandom && traits.usesSuperVoxels),
+          "only residual, ratio, delta, comb and free paths walk over super-voxels");
     needs("choice", traits.usesChoice() && !freePaths, "only residual has one");
     needs("size", traits.usesSuperVoxels || freePaths, "it uses no super-voxels");
     needs("roulette", !freePaths && traits.usesRoulette, "only residual, ratio and comb have one");
@@ -451,7 +453,7 @@ void run(const Command& command, const std::vector<std::string>& given) {
                                               "of march and comb: voxels between look-ups")(
         "roulette", po::bool_switch(),
         "end walks of residual, ratio and comb early, without bias, as renderers do: then standard "
-        "errors "
+        "errors, as those of comb always, "
         "are those that the samples show, and empty where they show none")(
         "choice", po::value<std::string>()->default_value("robust"),
         "control of the residual method: robust, mean, min or max (the last two only where it was "

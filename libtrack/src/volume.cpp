@@ -146,11 +146,14 @@ void addSuperVoxels(Volume& volume, BakedVolume baked, const VolumeOptions& opti
         }
         if (baked.kind == ControlKind::kTrilinear) {
             throw Error(TRK_ERROR_INVALID_ARGUMENT,
-                        where +
-                            ": its control is trilinear, of which no larger super-voxels "
-                            "follow; expected superVoxelSize 0 or " +
+                        where + ": super-voxels of " + std::to_string(options.superVoxelSize) +
+                            " do not follow from a trilinear control; expected 0 or " +
                             std::to_string(baked.superVoxelSize()));
         }
+        const uint64_t held = baked.items.size() * sizeof(BakedSuperVoxel) +
+                              (baked.gradients.size() + baked.shapes.size()) * sizeof(float) +
+                              baked.table.bytes();
+        checkMemory(volume.bytes() + held + held / 8, options.maxMemory, where);
         while (baked.superVoxelSize() < options.superVoxelSize) {
             baked = coarser(baked);
         }
@@ -213,13 +216,16 @@ Volume openVolume(const char* vdbPath, const char* sidecarPath, const VolumeOpti
         sidecar.header = readSidecarHeader(path);
     }
     // Larger super-voxels follow from gradients, which those of an affine control come with.
-    const bool isLarger = options.superVoxelSize > sidecar.header.superVoxelSize;
-    const SidecarParts parts = isLarger && sidecar.header.controlKind == ControlKind::kConstant
-                                   ? SidecarParts::kAll
-                                   : SidecarParts::kQueries;
+    const auto partsOf = [&](const SidecarHeader& header) {
+        return options.superVoxelSize > header.superVoxelSize &&
+                       header.controlKind == ControlKind::kConstant
+                   ? SidecarParts::kAll
+                   : SidecarParts::kQueries;
+    };
     Volume volume;
     if (vdbPath == nullptr) {
-        sidecar = readSidecar(path, nullptr, options.check, parts, options.maxMemory);
+        sidecar =
+            readSidecar(path, nullptr, options.check, partsOf(sidecar.header), options.maxMemory);
         volume.options = options;
         volume.grid = sidecar.header.source;
         if (options.gridNamed && options.gridName != volume.grid.name &&
@@ -247,7 +253,9 @@ Volume openVolume(const char* vdbPath, const char* sidecarPath, const VolumeOpti
             makeVolume(density.summary,
                        std::make_shared<const DensityField>(std::move(density.field)), options);
         if (haveSidecar) {
-            sidecar = readSidecar(path, &density.summary, options.check, parts, options.maxMemory);
+            const SidecarHeader header = readSidecarHeader(path, &density.summary.grid);
+            sidecar = readSidecar(path, &density.summary, options.check, partsOf(header),
+                                  options.maxMemory);
         }
     }
     volume.sidecarPath = path;

@@ -131,22 +131,18 @@ class VolumeExtinction {
                                     uint64_t& regions) const {
         return scaled(field_.integrate<F>(ray, t0, t1, kernel_, lookups, regions));
     }
-    /// Adds the extinction at the points of some combs in [t0, t1) to `sums`, and the integral of
-    /// constant regions to `depth`, in voxel lengths; how many points. See LineSamples.
-    uint64_t addSamples(const LocalRay& ray, double t0, double t1, double step,
-                        const double* offsets, size_t combs, std::array<double, C>* sums,
-                        std::array<double, C>& depth) const {
+    /// Adds the extinction at the points of some combs in [t0, t1), `points` each, to `sums`; how
+    /// many points that are. See DensityField.
+    uint64_t addSamples(const LocalRay& ray, double t0, double t1, double points,
+                        const double* offsets, size_t combs, std::array<double, C>* sums) const {
         std::array<double, F> densities[DensityField::kMostCombs];
         std::fill_n(densities, combs, std::array<double, F>{});
-        std::array<double, F> constant{};
         const uint64_t count =
-            field_.addSamples<F>(ray, t0, t1, kernel_, step, offsets, combs, densities, constant);
+            field_.addSamples<F>(ray, t0, t1, kernel_, points, offsets, combs, densities);
         for (size_t c = 0; c < C; ++c) {
-            const size_t f = F == 1 ? 0 : c;
             for (size_t j = 0; j < combs; ++j) {
-                sums[j][c] += scales_[c] * densities[j][f];
+                sums[j][c] += scales_[c] * densities[j][F == 1 ? 0 : c];
             }
-            depth[c] += scales_[c] * constant[f];
         }
         return count;
     }

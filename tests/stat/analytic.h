@@ -42,17 +42,14 @@ struct Ramp {
     void forEachRegion(const LocalRay&, double t0, double t1, Visit&& visit) const {
         visit(static_cast<const std::array<double, 1>*>(nullptr), t0, t1);
     }
-    uint64_t addSamples(const LocalRay& ray, double t0, double t1, double step,
-                        const double* offsets, size_t combs, std::array<double, 1>* sums,
-                        std::array<double, 1>&) const {
-        uint64_t count = 0;
+    uint64_t addSamples(const LocalRay& ray, double t0, double t1, double points,
+                        const double* offsets, size_t combs, std::array<double, 1>* sums) const {
         for (size_t j = 0; j < combs; ++j) {
-            for (double k = std::ceil(t0 / step - offsets[j]); (k + offsets[j]) * step < t1; ++k) {
-                sums[j][0] += extinction(ray.at((k + offsets[j]) * step))[0];
-                ++count;
+            for (double k = 0; k < points; ++k) {
+                sums[j][0] += extinction(ray.at(t0 + (k + offsets[j]) * (t1 - t0) / points))[0];
             }
         }
-        return count;
+        return static_cast<uint64_t>(points) * combs;
     }
     void prefetchEntry(const Vec3d&) const {}
     void prefetchBrick(const Vec3d&) const {}

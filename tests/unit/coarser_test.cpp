@@ -3,7 +3,10 @@
 #include "bake/coarser.h"
 
 #include "bake/bake.h"
+#include "bake/write_bake.h"
 #include "failure.h"
+#include "io/output_file.h"
+#include "io/sidecar.h"
 #include "support/fixtures.h"
 #include "volume.h"
 
@@ -113,6 +116,37 @@ TEST(Coarser, IsWhatABakeOfThatSizeSays) {
                                                               static_cast<float>(p[2] % 3));
                                                       })}))
                        .field);
+}
+
+// Which of them is coarsened, and from which numbers, is that of the density.
+TEST(Coarser, OpensTheSidecarOfItsGridFromAFileOfSeveral) {
+    openvdb::initialize();
+    const auto a = fixtures::makeBlob(40);
+    a->setName("a");
+    const auto b = fixtures::makeBlob(48);
+    b->setName("b");
+    const std::string vdb = fixtures::write("coarser_two.vdb", {a, b});
+    openvdb::GridCPtrVec all;
+    for (const std::string name : {"a", "b"}) {
+        const trk::Density density = fixtures::load(vdb, name);
+        const int size = name == "a" ? 32 : 4;
+        const trk::BakedVolume baked = trk::bake(density.field, fixtures::bakeOptions(size, 0));
+        const std::string path = fixtures::path("coarser_" + name + ".track.vdb");
+        trk::OutputFile file(path, true);
+        trk::writeSidecar(file, trk::sidecarHeader(density.summary, density.field, baked), baked,
+                          density.summary.anchor);
+        file.commit();
+        openvdb::io::File from(path);
+        from.open(false);
+        const openvdb::GridPtrVecPtr grids = from.getGrids();
+        all.insert(all.end(), grids->begin(), grids->end());
+    }
+    const std::string both = fixtures::write("coarser_both.track.vdb", all);
+    trk::VolumeOptions options;
+    options.gridNamed = true;
+    options.gridName = "b";
+    options.superVoxelSize = 16;
+    EXPECT_EQ(trk::openVolume(vdb.c_str(), both.c_str(), options).superVoxels->size(), 16);
 }
 
 TEST(Coarser, OpensASidecarAtEverySizeFromTheBakedOne) {

@@ -50,52 +50,29 @@ void expectTheSame(const trk::DensityField& field) {
     size_t looked = 0;
     for (int i = 0; i < 500; ++i) {
         const trk::LocalRay ray = randomRay(field.box(), random);
-        const double step = std::exp2(6 * unit(random) - 3);
+        const double points = std::ceil(ray.tEnd * std::exp2(3 - 6 * unit(random)));
         const double offsets[3] = {unit(random), unit(random), 0};
         for (const trk::Kernel kernel : {trk::Kernel::kBaseline, trk::Kernel::kAvx2}) {
             if (!trk::hasKernel(kernel)) {
                 continue;
             }
-            // In two parts, which must neither share a point nor lose one.
             std::array<double, C> sums[3] = {};
-            std::array<double, C> depth{};
-            const double middle = 0.37 * ray.tEnd;
-            uint64_t count = 0;
-            for (const bool second : {false, true}) {
-                count += field.addSamples<C>(ray, second ? middle : 0, second ? ray.tEnd : middle,
-                                             kernel, step, offsets, 3, sums, depth);
-            }
-            std::array<double, C> constant{};
-            uint64_t expectedCount = 0;
+            const uint64_t count =
+                field.addSamples<C>(ray, 0, ray.tEnd, kernel, points, offsets, 3, sums);
             std::array<double, C> expected[3] = {};
-            field.table().walk(
-                ray, 0, ray.tEnd,
-                [&](trk::SparseTable::Entry entry, const trk::Int3&, int, double t0, double t1) {
-                    for (size_t c = 0; c < C && trk::DensityField::isConstant(entry); ++c) {
-                        constant[c] += static_cast<double>(field.constant(entry)[c]) * (t1 - t0);
+            for (size_t j = 0; j < 3; ++j) {
+                for (double k = 0; k < points; ++k) {
+                    const auto density =
+                        field.density<C>(ray.at((k + offsets[j]) * (ray.tEnd / points)));
+                    for (size_t c = 0; c < C; ++c) {
+                        expected[j][c] += static_cast<double>(density[c]);
                     }
-                    for (size_t j = 0; j < 3 && !trk::DensityField::isConstant(entry); ++j) {
-                        for (double k = std::floor(t0 / step) - 2; (k + offsets[j]) * step < t1;
-                             ++k) {
-                            const double t = (k + offsets[j]) * step;
-                            if (t >= t0) {
-                                const auto density = field.density<C>(ray.at(t));
-                                for (size_t c = 0; c < C; ++c) {
-                                    expected[j][c] += static_cast<double>(density[c]);
-                                }
-                                ++expectedCount;
-                            }
-                        }
-                    }
-                    return true;
-                });
-            EXPECT_EQ(count, expectedCount);
-            for (size_t c = 0; c < C; ++c) {
-                EXPECT_NEAR(depth[c], constant[c], 1e-12 * (1 + constant[c]));
-                for (size_t j = 0; j < 3; ++j) {
-                    EXPECT_NEAR(sums[j][c], expected[j][c], 2e-6 * (1 + expected[j][c]));
+                }
+                for (size_t c = 0; c < C; ++c) {
+                    EXPECT_NEAR(sums[j][c], expected[j][c], 4e-6 * (1 + expected[j][c]));
                 }
             }
+            EXPECT_LE(static_cast<double>(count), 3 * points);
             looked += count;
         }
     }

@@ -54,7 +54,9 @@ BakedSuperVoxel statisticsOf(const Octants& octants) {
     for (size_t i = 0; i < 8; ++i) {
         const double deviation =
             octants.items[i] ? static_cast<double>(octants.items[i]->deviation) : 0.0;
-        const double off = octants.mean(i) - static_cast<double>(v.mean);
+        // Means are floats: so much more they may be off.
+        const double off =
+            std::fabs(octants.mean(i) - static_cast<double>(v.mean)) + 0x1p-24 * octants.mean(i);
         square += (deviation * deviation + off * off) / 8;
     }
     const double reach = std::max(static_cast<double>(v.mean) - static_cast<double>(v.min),
@@ -117,7 +119,7 @@ void setResidual(const Octants& octants, const ControlPolynomial& control, Baked
         const double deviation = static_cast<double>(item.deviation);
         const double spread = gradientSpread(octants.size);
         const double own = deviation * deviation;
-        const double off = octants.mean(i) - there;
+        const double off = std::fabs(octants.mean(i) - there) + 0x1p-24 * octants.mean(i);
         square += (std::max(own - fitted * spread, 0.0) + kRounding * own + off * off +
                    differing * spread) /
                   8;

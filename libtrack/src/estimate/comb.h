@@ -77,18 +77,25 @@ inline double seriesEstimate(const double* depths, size_t order) {
     return total / static_cast<double>(order + 1);
 }
 
-/// One estimate of the transmittance of the whole ray, per channel, by combs `step` voxel lengths
-/// apart over what is smooth enough for that step, exactly over the rest.
+/// One estimate of the transmittance of the whole ray, per channel, by combs of points at most
+/// `step` voxel lengths apart over what varies little enough, exactly over the rest.
 ///
-/// The variance of a comb's depth X says whether the series converges fast. Within a super-voxel of
-/// length L and deviation s it is at most (s L)^2, were all its points to err alike; super-voxels
-/// err independently. What exceeds its share of kMostSpread is integrated exactly.
+/// A comb has as many points in a stretch wherever it is shifted to, at a distance h; of them,
+/// those in a super-voxel of length l take its part of the depth but for at most h. Let m be the
+/// middle between its minimum and maximum, and r what these are apart. What the points leave of m
+/// is at most r / 2 (l + h); what the m leave, summed by parts, at most h times what neighbours' m
+/// differ by, which is r at most, as the density is continuous. So the depth X that a comb finds
+/// lies within a range of the sum of r (l + 3 h), whatever the density is. And if lines meet what
+/// super-voxels hold, its standard deviation is the sum of s (l + 3 h) at most, s being theirs,
+/// were all points to err alike. Super-voxels that take more than their share of kMostDeviation or
+/// kMostRange are integrated exactly: the series then converges fast, and always.
 template <class Field, class SuperVoxels, class Random>
 std::array<double, Field::kChannels> combTransmittance(
     const Field& field, const SuperVoxels& superVoxels, const LocalRay& ray,
     const TrackingSettings& settings, double step, Random& random, PathCost& cost) {
     constexpr size_t C = Field::kChannels;
-    constexpr double kMostSpread = 0.25;
+    constexpr double kMostDeviation = 0.5;
+    constexpr double kMostRange = 3;
     const double unit = settings.lengthPerVoxel;
     auto cursor = superVoxels.cursor(ray, 0, ray.tEnd);
     Throughput<C> sofar;
@@ -112,17 +119,21 @@ std::array<double, Field::kChannels> combTransmittance(
             return values;
         }
         cost.superVoxels += count;
+        const double reach =
+            unit * (length + 3 * static_cast<double>(count) * std::min(step, length));
         enum class Stretch { kHomogeneous, kSmooth, kRough };
         const auto kindOf = [&](size_t i) {
-            const double l = cursor.tExit(i) - cursor.tEnter(i);
             Stretch kind = Stretch::kHomogeneous;
             for (size_t c = 0; c < C; ++c) {
                 const SuperVoxel& record = cursor.record(i, c);
-                const double s =
-                    unit * superVoxels.scale(c) * static_cast<double>(record.deviation);
-                const Stretch ofChannel = record.min == record.max           ? Stretch::kHomogeneous
-                                          : s * s * l * length > kMostSpread ? Stretch::kRough
-                                                                             : Stretch::kSmooth;
+                const double scale = superVoxels.scale(c) * reach;
+                const bool isRough =
+                    scale * static_cast<double>(record.deviation) > kMostDeviation ||
+                    scale * (static_cast<double>(record.max) - static_cast<double>(record.min)) >
+                        kMostRange;
+                const Stretch ofChannel = record.min == record.max ? Stretch::kHomogeneous
+                                          : isRough                ? Stretch::kRough
+                                                                   : Stretch::kSmooth;
                 kind = std::max(kind, ofChannel);
             }
             return kind;
@@ -133,8 +144,7 @@ std::array<double, Field::kChannels> combTransmittance(
         for (size_t j = 0; j < combs; ++j) {
             offsets[j] = random.uniform();
         }
-        std::array<double, C> sums[SeriesOrder::kMost + 1];
-        std::fill_n(sums, combs, std::array<double, C>{});
+        double depths[C][SeriesOrder::kMost + 1] = {};
         std::array<double, C> exact{};
         for (size_t i = 0; i < count;) {
             const Stretch kind = kindOf(i);
@@ -160,18 +170,21 @@ std::array<double, Field::kChannels> combTransmittance(
                 }
                 cost.exactLength += tExit - tEnter;
             } else {
-                cost.lookups +=
-                    field.addSamples(ray, tEnter, tExit, step, offsets, combs, sums, exact);
+                const double points = std::ceil((tExit - tEnter) / step);
+                std::array<double, C> found[SeriesOrder::kMost + 1];
+                std::fill_n(found, combs, std::array<double, C>{});
+                cost.lookups += field.addSamples(ray, tEnter, tExit, points, offsets, combs, found);
+                for (size_t j = 0; j < combs; ++j) {
+                    for (size_t c = 0; c < C; ++c) {
+                        depths[c][j] += unit * (tExit - tEnter) / points * found[j][c];
+                    }
+                }
                 isRandom = true;
             }
         }
         for (size_t c = 0; c < C; ++c) {
-            double depths[SeriesOrder::kMost + 1];
-            for (size_t j = 0; j < combs; ++j) {
-                depths[j] = unit * step * sums[j][c];
-            }
-            sofar.multiply(c, seriesEstimate(depths, series.order()));
-            sofar.integrate(c, unit * exact[c] + depths[0]);
+            sofar.multiply(c, seriesEstimate(depths[c], series.order()));
+            sofar.integrate(c, unit * exact[c] + depths[c][0]);
         }
         cost.random = cost.random || isRandom;
         if (sofar.isZero()) {

@@ -66,20 +66,20 @@ std::array<double, C> integrateLine(const DensityField& field, const Stored* bri
 
 template <size_t C, class Stored>
 uint64_t sampleLine(const DensityField& field, const Stored* bricks, const LocalRay& ray, double t0,
-                    double t1, double step, const double* offsets, size_t combs,
-                    std::array<double, C>* sums, std::array<double, C>& depth) {
-    LineSamples<C, Stored> line(field, bricks, ray, step, offsets, combs, sums);
-    line.add(t0, t1, depth);
+                    double t1, double points, const double* offsets, size_t combs,
+                    std::array<double, C>* sums) {
+    LineSamples<C, Stored> line(field, bricks, ray, t0, t1, points, offsets, combs, sums);
+    line.add();
     return line.count();
 }
 
 #ifdef TRACK_AVX2
 template <size_t C, class Stored>
 TRACK_AVX2 uint64_t sampleLineAvx2(const DensityField& field, const Stored* bricks,
-                                   const LocalRay& ray, double t0, double t1, double step,
-                                   const double* offsets, size_t combs, std::array<double, C>* sums,
-                                   std::array<double, C>& depth) {
-    return sampleLine<C>(field, bricks, ray, t0, t1, step, offsets, combs, sums, depth);
+                                   const LocalRay& ray, double t0, double t1, double points,
+                                   const double* offsets, size_t combs,
+                                   std::array<double, C>* sums) {
+    return sampleLine<C>(field, bricks, ray, t0, t1, points, offsets, combs, sums);
 }
 template <size_t C, class Stored>
 TRACK_AVX2 std::array<double, C> integrateLineAvx2(const DensityField& field, const Stored* bricks,
@@ -114,25 +114,23 @@ template std::array<double, 3> DensityField::integrate<3>(const LocalRay&, doubl
 
 template <size_t C>
 uint64_t DensityField::addSamples(const LocalRay& ray, double t0, double t1, Kernel kernel,
-                                  double step, const double* offsets, size_t combs,
-                                  std::array<double, C>* sums, std::array<double, C>& depth) const {
+                                  double points, const double* offsets, size_t combs,
+                                  std::array<double, C>* sums) const {
     const auto run = [&](const auto* bricks) {
 #ifdef TRACK_AVX2
         if (kernel == Kernel::kAvx2) {
-            return sampleLineAvx2<C>(*this, bricks, ray, t0, t1, step, offsets, combs, sums, depth);
+            return sampleLineAvx2<C>(*this, bricks, ray, t0, t1, points, offsets, combs, sums);
         }
 #endif
         static_cast<void>(kernel);
-        return sampleLine<C>(*this, bricks, ray, t0, t1, step, offsets, combs, sums, depth);
+        return sampleLine<C>(*this, bricks, ray, t0, t1, points, offsets, combs, sums);
     };
     return isHalf() ? run(halfs_.data()) : run(floats_.data());
 }
 
 template uint64_t DensityField::addSamples<1>(const LocalRay&, double, double, Kernel, double,
-                                              const double*, size_t, std::array<double, 1>*,
-                                              std::array<double, 1>&) const;
+                                              const double*, size_t, std::array<double, 1>*) const;
 template uint64_t DensityField::addSamples<3>(const LocalRay&, double, double, Kernel, double,
-                                              const double*, size_t, std::array<double, 3>*,
-                                              std::array<double, 3>&) const;
+                                              const double*, size_t, std::array<double, 3>*) const;
 
 }  // namespace trk

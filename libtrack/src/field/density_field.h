@@ -189,14 +189,12 @@ class DensityField {
     std::array<double, C> integrate(const LocalRay& ray, double t0, double t1, Kernel kernel,
                                     uint64_t& lookups, uint64_t& regions) const;
 
-    /// The density at the points of `combs` combs in [t0, t1) of the ray, (k + offset) x step for
-    /// whole k, added up in `sums` where it lies in bricks; of constant regions the integral, in
-    /// voxel lengths, is added to `depth`. How many points were looked up.
+    /// Adds up the density at `points` equidistant points of each of `combs` combs in [t0, t1) of
+    /// the ray, at offsets from 0 to 1 of their distance. How many points were looked up.
     static constexpr size_t kMostCombs = 32;
     template <size_t C>
-    uint64_t addSamples(const LocalRay& ray, double t0, double t1, Kernel kernel, double step,
-                        const double* offsets, size_t combs, std::array<double, C>* sums,
-                        std::array<double, C>& depth) const;
+    uint64_t addSamples(const LocalRay& ray, double t0, double t1, Kernel kernel, double points,
+                        const double* offsets, size_t combs, std::array<double, C>* sums) const;
 
     /// As integrate, over the part of a ray in the region at `lo` that an entry stands for; adds
     /// the cells of a brick to `cells`.

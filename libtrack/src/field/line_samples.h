@@ -12,30 +12,36 @@
 #include <cstddef>
 #include <cstdint>
 #include <cstring>
+#include <limits>
 
 namespace trk {
 
-/// Combs of points at (k + offset) x step for whole k, along a ray. C: the density's channels.
+/// Combs of equidistant points in a stretch of a ray, as many in each comb, all shifted by a part
+/// of their distance. C: the density's channels.
 template <size_t C, class Stored>
 class LineSamples {
   public:
+    /// Of `points` points a comb in [t0, t1): at t0 + (k + offset) x their distance, k from 0 on.
     /// `sums`: of each comb, C numbers, to which add() adds; `offsets`: from 0 to 1, `combs` of
     /// them. All arguments must live as long.
-    LineSamples(const DensityField& field, const Stored* bricks, const LocalRay& ray, double step,
-                const double* offsets, size_t combs, std::array<double, C>* sums)
+    LineSamples(const DensityField& field, const Stored* bricks, const LocalRay& ray, double t0,
+                double t1, double points, const double* offsets, size_t combs,
+                std::array<double, C>* sums)
         : field_(field),
           bricks_(bricks),
           ray_(ray),
-          step_(step),
-          perStep_(1 / step),
+          t0_(t0),
+          t1_(t1),
+          points_(points),
+          step_((t1 - t0) / points),
+          perStep_(points / (t1 - t0)),
           offsets_(offsets),
           combs_(combs),
           sums_(sums) {}
 
-    /// The density in [t0, t1): in bricks at the combs' points; of constant regions the integral,
-    /// in voxel lengths, to `depth`.
-    void add(double t0, double t1, std::array<double, C>& depth) {
-        TableCursor cursor(field_.table(), ray_, t0, t1);
+    /// The density at all points.
+    void add() {
+        TableCursor cursor(field_.table(), ray_, t0_, t1_);
         while (const size_t count = cursor.refill()) {
             const Lattice lattice = cursor.lattice();
             for (size_t i = 0; i < count; ++i) {
@@ -43,16 +49,22 @@ class LineSamples {
                 const double tEnter = cursor.tEnter(i);
                 const double tExit = cursor.tExit(i);
                 if (DensityField::isConstant(entry)) {
-                    for (size_t c = 0; c < C; ++c) {
-                        depth[c] +=
-                            static_cast<double>(field_.constant(entry)[c]) * (tExit - tEnter);
+                    const float* constant = field_.constant(entry);
+                    for (size_t comb = 0; comb < combs_; ++comb) {
+                        forEachPoint(tEnter, tExit, offsets_[comb], [&](double) {
+                            ++met_;
+                            for (size_t c = 0; c < C; ++c) {
+                                sums_[comb][c] += static_cast<double>(constant[c]);
+                            }
+                        });
                     }
                     continue;
                 }
                 const Stored* brick = bricks_ + (entry - 1) * DensityField::kBrickVertices * C;
                 const Vec3d lo = cursor.lo(i, lattice);
                 for (size_t comb = 0; comb < combs_; ++comb) {
-                    find(brick, lo, tEnter, tExit, comb);
+                    forEachPoint(tEnter, tExit, offsets_[comb],
+                                 [&](double t) { find(brick, lo, t, comb); });
                 }
             }
         }
@@ -63,26 +75,31 @@ class LineSamples {
   private:
     static constexpr size_t kMost = 64;  // points whose values are on their way from memory at once
 
-    /// The points of a comb in a brick.
-    void find(const Stored* brick, const Vec3d& lo, double tEnter, double tExit, size_t comb) {
-        const double offset = offsets_[comb];
-        // The first one is decided by the time itself, so that none is met twice or not at all.
-        double k = std::ceil(tEnter * perStep_ - offset) - 1;
-        while ((k + offset) * step_ < tEnter) {
+    /// Calls f(t) for the points of a comb in [tEnter, tExit). The first one is decided by the time
+    /// itself, so that none is met twice or not at all.
+    template <class F>
+    void forEachPoint(double tEnter, double tExit, double offset, const F& f) const {
+        double k = std::ceil((tEnter - t0_) * perStep_ - offset) - 1;
+        while (t0_ + (k + offset) * step_ < tEnter) {
             ++k;
         }
-        for (double t = (k + offset) * step_; t < tExit; t = (++k + offset) * step_) {
-            if (found_ == kMost) {
-                look();
-            }
-            time_[found_] = t;
-            for (size_t a = 0; a < 3; ++a) {
-                origin_[a][found_] = ray_.origin[static_cast<int>(a)] - lo[static_cast<int>(a)];
-            }
-            corner_[found_] = brick;
-            comb_[found_] = static_cast<uint32_t>(comb);
-            ++found_;
+        for (double t = t0_ + (k + offset) * step_; t < tExit && k < points_;
+             t = t0_ + (++k + offset) * step_) {
+            f(t);
         }
+    }
+
+    void find(const Stored* brick, const Vec3d& lo, double t, size_t comb) {
+        if (found_ == kMost) {
+            look();
+        }
+        time_[found_] = t;
+        for (size_t a = 0; a < 3; ++a) {
+            origin_[a][found_] = ray_.origin[static_cast<int>(a)] - lo[static_cast<int>(a)];
+        }
+        corner_[found_] = brick;
+        comb_[found_] = static_cast<uint32_t>(comb);
+        ++found_;
     }
 
     /// Where in their bricks the points' cells are, and where in the cells the points.
@@ -172,7 +189,9 @@ class LineSamples {
                 }
                 const Float8 v0 = v[0] + far[1] * (v[1] - v[0]);
                 const Float8 v1 = v[2] + far[1] * (v[3] - v[2]);
-                const Float8 value = v0 + far[0] * (v1 - v0);
+                Float8 value = v0 + far[0] * (v1 - v0);
+                // By rounding, it may be more than a float.
+                takeLesser(Float8(Float8{} + std::numeric_limits<float>::max()), value);
                 for (size_t k = 0; k < count; ++k) {
                     sums_[comb_[i + k]][c] += static_cast<double>(value[k]);
                 }
@@ -184,6 +203,9 @@ class LineSamples {
     const DensityField& field_;
     const Stored* bricks_;
     const LocalRay& ray_;
+    double t0_;
+    double t1_;
+    double points_;
     double step_;
     double perStep_;
     const double* offsets_;

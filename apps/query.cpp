@@ -432,7 +432,7 @@ void run(const Command& command, const std::vector<std::string>& given) {
         "(residual "
         "ratio tracking, least noise), ratio (ratio tracking), delta (delta tracking, 0 or 1), "
         "comb "
-        "(unbiased ray marching, next to exact and often faster); "
+        "(unbiased ray marching, next to exact, faster where volumes are deep); "
         "biased: control (the control alone, no noise), march (ray marching)")(
         "free-paths", po::bool_switch(),
         "sample where a photon collides instead, by --method residual (decomposition tracking, "

@@ -92,7 +92,7 @@ enum {
     TRK_METHOD_DELTA = 4,    /**< delta tracking: unbiased, 0 or 1, most noise; needs a sidecar */
     TRK_METHOD_MARCH = 5,    /**< ray marching from a random offset: biased, noise where steps are
                                   long; the density alone */
-    TRK_METHOD_COMB = 6 /**< unbiased ray marching: little noise, for less than exact integration;
+    TRK_METHOD_COMB = 6 /**< unbiased ray marching: little noise, and fast where volumes are deep;
                              needs a sidecar [Kettunen21] */
 };
 
